@@ -88,7 +88,7 @@ COARSE = [
     f"sim.device={DEVICE}",
 ]
 EVERYTHING = {
-    "observe": ["state", "particles", "depth", "rgb", "segmentation"],
+    "observe": ["state", "particles", "points", "depth", "rgb", "segmentation"],
     "cameras": {"top": {"position": (0.5, 2.0, 0.5), "target": (0.5, 0.0, 0.5), "size": (24, 16)}},
 }
 
@@ -101,6 +101,13 @@ def test_environments_observe_by_key():
     assert one in env.observation_space and both in many.observation_space
     assert one["top_depth"].shape == (16, 24, 1) and one["top_rgb"].shape == (16, 24, 3)
     assert {0, FIRST_MANIPULATOR, FIRST_BODY} >= set(np.unique(one["top_segmentation"])) - {FLOOR}
+    points, particles = one["points"], one["particles"]
+    center = particles.mean(axis=0)
+    outer = np.linalg.norm(points[:, :3] - center, axis=1)
+    radius = np.linalg.norm(particles - center, axis=1).max()
+    assert points.shape == (200, 4) and np.mean(outer > 0.6 * radius) > 0.9
+    # From straight above the upper half is seen.
+    assert np.mean((points[:, 1] > center[1]) == (points[:, 3] > 0)) > 0.8
     for _ in range(many.unwrapped.batch.horizon):
         action = env.action_space.sample()
         one, *_rest = env.step(action)

@@ -141,8 +141,9 @@ def test_wrong_actions_and_options_are_refused(env: PlabEnv, vector: PlabVectorE
     for actions in (np.zeros(6), np.full((2, 6), np.nan)):
         with pytest.raises(ValueError, match="actions"):
             vector.step(actions)
-    with pytest.raises(ValueError, match="reset_mask"):
-        vector.reset(options={"reset_mask": np.array([True, False])})
+    for mask in ([False, False], [True], [1, 0]):
+        with pytest.raises(ValueError, match="reset_mask"):
+            vector.reset(options={"reset_mask": np.array(mask)})
     for one in (env, vector):
         with pytest.raises(ValueError, match="'start'"):
             one.reset(options={"start": 1})
@@ -290,7 +291,7 @@ def test_what_breaks_off_rests_until_the_next_episode(vector: PlabVectorEnv, at:
 
     def episode(broken_at: int | None) -> list[core.Transition]:
         observation, info = batch.reset()
-        done = [core.Transition(observation, np.zeros(2), False, info)]
+        done = [core.Transition(observation, np.zeros(2), np.zeros(2, bool), np.zeros(2, bool), info)]
         for t, action in enumerate(actions):
             if t == broken_at:
                 make_not_finite(batch.problem.simulator, 0)

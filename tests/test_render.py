@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
 import reference_mpm
 from plab import results
@@ -23,7 +24,9 @@ from plab.render.rollouts import record
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, target_field
-from plab.scenes import Body, Manipulator, Scene, sample_particles
+from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
+from plab.sim import Simulator
+from plab.sim.cameras import CameraSensor
 from suite import KINDS, SCALES, SIZES
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
@@ -348,3 +351,29 @@ def test_known_demonstrations_are_replayed_and_others_are_of_zeros(monkeypatch, 
     assert "4 action components" in line and "6" in line
     Path("file").touch()
     assert "file/rope.png" in told(*argv, "--output", "file/rope.png")
+
+
+@pytest.mark.parametrize("position", [(0.5, 0.9, 1.7), (0.5, 2.0, 0.5)])
+def test_depth_and_labels_agree_with_pictures_to_a_pixel(position):
+    """Cameras of observations beside VTK's depth: things alone, from the front and from straight above."""
+    camera = Camera(position, (0.45, 0.15, 0.5), 35.0, (128, 96))
+    ball = Body("sphere", (0.4, 0.2, 0.5), (0.12,), 20000)
+    one = scene(Manipulator("Sphere", (0.06,), (0.65, 0.1, 0.5), scale=(0.01,) * 3), bodies=(ball,))
+    seen = CameraSensor(Simulator([one]), camera).capture()
+    depth, labels = seen["depth"][0], seen["segmentation"][0]
+    with closing(Renderer(one, size=camera.size, camera=camera)) as renderer:
+        renderer.frame(sample_particles(one), start_poses(one))
+        things = (renderer._manipulators[0], 2), (renderer._bodies[0], 64)
+        shown = [([actor for actor in thing.actors if actor.visibility], label) for thing, label in things]
+        for actors, label in shown:
+            for other in renderer._plotter.renderer.actors.values():
+                other.visibility = any(other is actor for actor in actors)
+            renderer._plotter.renderer.ResetCameraClippingRange()
+            renderer._plotter.render()
+            known = -renderer._plotter.get_image_depth()
+            mine, there = labels == label, np.isfinite(known)
+            assert there.sum() > 60
+            assert not (mine & ~binary_dilation(there, np.ones((3, 3)))).any()
+            assert not (there & ~binary_dilation(mine, np.ones((3, 3)))).any()
+            inner = binary_erosion(mine & there, np.ones((5, 5)))
+            assert np.abs(depth - known)[inner].max() < (0.005 if label == 2 else 0.035)

@@ -124,7 +124,7 @@ def test_environments():
     assert names["info"]["score"] >= 0.0
     assert names["infos"]["final_info"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
-    assert names["done"].reward.shape == (4,) and names["done"].truncated
+    assert names["done"].reward.shape == (4,) and names["done"].truncated.all()
 
 
 def test_results(monkeypatch, tmp_path):

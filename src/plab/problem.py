@@ -7,8 +7,9 @@ particles and manipulators, grid); variants of one task do.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from plab.objective import (
     scores,
     scores_from_iou,
     soft_iou,
+    spread_mass,
     target_sdf,
     total_loss,
 )
@@ -46,7 +48,11 @@ __all__ = [
     "kinds_of",
     "make_simulator",
     "make_targets",
+    "target_distance",
 ]
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,6 @@ class Problem:
         term_names: Names of the terms of the loss; those of weight 0 are left out.
         weights: Their weights, shape [term].
         labels: What they measure, with unit, by their columns in results.
-        initial_mass: Mass tensors of the initial states, shape [batch, n, n, n].
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
         initial_scores: How close the initial states are.
     """
@@ -189,14 +194,16 @@ class Problem:
         first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or make_simulator(cfgs)
         self.scenes = self.simulator.scenes
+        _warn_of_thin(self.scenes)
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
         self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
         # Distances to equal targets are equal.
-        distances = {kind: _distance(self.target_mass[k]) for kind, k in first.items()}
-        self.simulator.set_target(self.target_mass, np.stack([distances[kind] for kind in kinds]))
+        distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
+        self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
+        self.simulator.set_target(self.target_mass, np.stack(self._distances))
         self.simulator.set_weights({name: weights[name] for name in self.term_names})
         # Making a target leaves another contact model behind than finding it in the cache.
         self.simulator.set_contact("soft")
@@ -210,19 +217,79 @@ class Problem:
             kinds: Texts that are equal for equal environments; all may differ if None.
         """
         self.simulator.reset()
-        self.scenes, self.target_mass = self.simulator.scenes, self.simulator.target_mass
-        self.initial_mass = self.simulator.mass_tensor()
+        self.scenes, self._initial_mass = self.simulator.scenes, self.simulator.mass_tensor()
+        self._stale_mass: set[int] = set()
+        if self.target_mass is not self.simulator.target_mass:
+            self.target_mass, self._distances = self.simulator.target_mass, None
         kinds = [str(k) for k in range(len(self.scenes))] if kinds is None else kinds
         pairs = {
             kind: (mass, target)
-            for kind, mass, target in zip(kinds, self.initial_mass, self.target_mass, strict=True)
+            for kind, mass, target in zip(kinds, self._initial_mass, self.target_mass, strict=True)
         }
         judged = {kind: scores(mass, mass, target) for kind, (mass, target) in pairs.items()}
         self.initial_scores = [judged[kind] for kind in kinds]
-        start, best = zip(
-            *((one.iou_initial, one.iou_target_self) for one in self.initial_scores), strict=True
-        )
-        self._scale = Constants(score_scale(start, best))
+        self._rescale()
+
+    def vary(
+        self,
+        scenes: Sequence[Scene],
+        particles: Mapping[int, np.ndarray],
+        targets: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    ) -> None:
+        """Change what the next episodes start from; :meth:`note_starts` is due when they have started.
+
+        Args:
+            scenes: One scene per environment, of the same kind as before.
+            particles: Initial positions of environments in which they change, [particle, 3] each.
+            targets: Mass tensors of environments in which they change, and the distances to them, shape [n,
+                n, n] each.
+
+        Raises:
+            plab.scenes.SceneError: If a scene cannot be simulated; nothing is changed then.
+            ValueError: If positions do not fit; likewise.
+        """
+        simulator = self.simulator
+        simulator.change_scenes(scenes, particles)
+        self.scenes = simulator.scenes
+        self._stale_mass |= set(particles)
+        if targets:
+            masses, distances = list(self.target_mass), self.distances()
+            for e, (mass, distance) in targets.items():
+                masses[e], distances[e] = mass, distance
+            self.target_mass, self._distances = np.stack(masses), distances
+            simulator.set_target(self.target_mass, np.stack(distances))
+            for e in targets:
+                best = soft_iou(self.target_mass[e], self.target_mass[e])
+                self.initial_scores[e] = replace(self.initial_scores[e], iou_target_self=best)
+
+    def note_starts(self, environments: Sequence[int], iou: np.ndarray) -> None:
+        """Score environments from now on by the soft IoUs of their initial states, shape [batch]."""
+        for e in environments:
+            start = float(iou[e])
+            self.initial_scores[e] = scores_from_iou(start, start, self.initial_scores[e].iou_target_self)
+        self._rescale()
+
+    def distances(self) -> list[np.ndarray]:
+        """Return the distances to the targets, shape [n, n, n] each."""
+        if self._distances is None:
+            self._distances = [target_distance(mass) for mass in self.target_mass]
+        return list(self._distances)
+
+    @property
+    def initial_mass(self) -> np.ndarray:
+        """Mass tensors of the initial states, shape [batch, n, n, n]."""
+        if self._stale_mass:
+            x = self.simulator.initial_state().x
+            for e in self._stale_mass:
+                scene = self.scenes[e]
+                spread = spread_mass(x[e], scene.grid_size, scene.particle_mass, scene.floor_stencil)
+                self._initial_mass[e] = spread
+            self._stale_mass = set()
+        return self._initial_mass
+
+    def _rescale(self) -> None:
+        pairs = ((one.iou_initial, one.iou_target_self) for one in self.initial_scores)
+        self._scale = Constants(score_scale(*zip(*pairs, strict=True)))
 
     def loss_of(self, terms: Any) -> Any:
         """Weigh and add terms, shape [..., term]; an array or a tensor of shape [...]."""
@@ -307,7 +374,20 @@ class Problem:
         return [self._score(e, iou) for e, iou in enumerate(ious)]
 
 
-def _distance(mass: np.ndarray) -> np.ndarray:
+def _warn_of_thin(scenes: Sequence[Scene]) -> None:
+    """Log a line for manipulators that fit between the nodes of the grid, on which contact acts."""
+    thin = {
+        f"manipulators[{number}] is {2 * min(tool.size):.2g} thin, less than half a cell of the grid, "
+        f"{scene.dx / 2:.2g}: it passes through bodies; use a finer grid"
+        for scene in scenes
+        for number, tool in enumerate(scene.manipulators)
+        if 4 * min(tool.size) < scene.dx
+    }
+    for line in sorted(thin):
+        _log.warning("%s", line)
+
+
+def target_distance(mass: np.ndarray) -> np.ndarray:
     """Return the distance to a target, shape [n, n, n]."""
     try:
         return target_sdf(mass)

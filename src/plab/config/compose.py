@@ -28,6 +28,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.config.draws import with_own_materials
 from plab.config.families import family
 from plab.config.run import Config
 from plab.config.suite import conf_folder
@@ -282,12 +283,18 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     name, own = cfg.task.name, [f"variant={cfg.variant}"]
     if cfg.seed_scene is not None:
         own = ["variant=random", f"seed_scene={cfg.seed_scene}"]
-    if load_config([f"task={name}", *own]).task != cfg.task:
+    ranges = cfg.task.randomize
+
+    def drawing(one: Config) -> Config:
+        return with_own_materials(replace(one, task=replace(one.task, randomize=ranges)))
+
+    if drawing(load_config([f"task={name}", *own])).task != with_own_materials(cfg).task:
         raise ConfigError(
             f"scenes of task {name} are drawn as its file has it: leave out what changes the task, or draw "
             "none"
         )
-    drawn = [load_config([f"task={name}", "variant=random", f"seed_scene={int(seed)}"]) for seed in seeds]
+    words = [[f"task={name}", "variant=random", f"seed_scene={int(seed)}"] for seed in seeds]
+    drawn = [drawing(load_config(own)) for own in words]
     return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from plab.config import ranges
+from plab.config.draws import ranges_of
 from plab.errors import ConfigError
 from plab.files import ShapeError, pinned
 from plab.kinematics import Chain, ModelError, locate_model, read_model
 from plab.laws import find_law
-from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
+from plab.scenes import MATERIAL_KEYS, Body, Camera, Manipulator, SceneError, make_body
 from plab.targets import TargetError, make_recipe
 
 
@@ -271,6 +272,9 @@ class TaskConfig(ranges.Section):
         variants: By name: what each variant changes: a part of this very structure, merged over it.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
+        randomize: Ranges of what every episode of an environment draws, see :mod:`plab.config.draws`; empty
+            where all episodes are alike.
+        cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
         release: Numbers of the PlasticineLab release where they differ, merged over this structure, variants
             included, by ``protocol.numbers=release``. Empty in a run's configuration.
     """
@@ -286,6 +290,8 @@ class TaskConfig(ranges.Section):
     target: dict[str, Any]
     variants: dict[str, Any]
     random: dict[str, Any] = field(default_factory=dict)
+    randomize: dict[str, Any] = field(default_factory=dict)
+    cameras: dict[str, Any] = field(default_factory=dict)
     release: dict[str, Any] = field(default_factory=dict)
     kinematics: KinematicsConfig | None = None
 
@@ -303,6 +309,12 @@ class TaskConfig(ranges.Section):
             make_recipe(self.target)
         except TargetError as error:
             raise ConfigError(f"{path}.{error}") from None
+        ranges_of(self)
+        for name, camera in self.cameras.items():
+            try:
+                Camera(**camera)
+            except (SceneError, TypeError, ValueError) as error:
+                raise ConfigError(f"{path}.cameras.{name}: {error}") from None
 
     def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
         """Return the scene's bodies, see :meth:`BodyConfig.build`.

@@ -1,4 +1,4 @@
-"""Batch of episodes that start, advance and end together, below the environments of all libraries.
+"""Batch of episodes in one simulator, below the environments of all libraries.
 
 The environments for Gymnasium, Stable-Baselines3 and PyTorch are views of an :class:`EpisodeBatch` in the
 form that each library asks for, and add nothing of their own.
@@ -6,17 +6,21 @@ form that each library asks for, and add nothing of their own.
 
 from __future__ import annotations
 
+import functools
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config
+from plab.config.draws import Values, with_own_materials
 from plab.config.selection import OBSERVED
 from plab.config.words import prepared
+from plab.envs.draws import Draws
 from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
@@ -31,27 +35,77 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METADATA",
-    "PICTURE_SIZE",
     "EpisodeBatch",
     "EpisodeState",
     "Restorable",
     "Transition",
     "check_render_mode",
     "compose_configs",
-    "refuse_options",
+    "info_of",
+    "make_batch",
 ]
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
 
-PICTURE_SIZE = (480, 360)
-"""Default width and height of pictures [pixels]."""
-
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 """Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
 
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+_LOCK = threading.RLock()
+"""Held by whoever simulates: Taichi compiles and launches kernels for one thread at a time."""
+
+
+def _alone(method: _Method) -> _Method:
+    """Let threads call a method one after the other."""
+
+    @functools.wraps(method)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with _LOCK:
+            return method(*args, **kwargs)
+
+    return call  # type: ignore[return-value]
+
 
 # -------------------------------------------------------------------------------------------------- arguments
+
+
+@_alone
+def make_batch(
+    task: str,
+    variant: str,
+    *,
+    num_envs: int = 1,
+    overrides: Sequence[str] = (),
+    overrides_per_env: Sequence[Sequence[str]] | None = None,
+    config_dir: str | Path | None = None,
+    **options: Any,
+) -> EpisodeBatch:
+    """Make the episodes of an environment.
+
+    Args:
+        task: Name of the task.
+        variant: Name of its variant.
+        num_envs: Number of sub-environments.
+        overrides: Overrides for all of them, as on the command line: ``["sim.device=cuda"]``.
+        overrides_per_env: Further overrides, one list per sub-environment, such as ``[["variant=1"],
+            ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
+        config_dir: Folder with YAML files of the user's own.
+        **options: Keyword arguments of :class:`EpisodeBatch`.
+
+    Raises:
+        ValueError: If an argument does not fit; see also :class:`EpisodeBatch`.
+    """
+    cfgs = compose_configs(
+        task,
+        variant,
+        num_envs=num_envs,
+        overrides=overrides,
+        overrides_per_env=overrides_per_env,
+        config_dir=config_dir,
+    )
+    return EpisodeBatch(cfgs, **options)
 
 
 def compose_configs(
@@ -95,12 +149,6 @@ def compose_configs(
     return [made[entries] for entries in lists]
 
 
-def refuse_options(options: Mapping[str, Any] | None) -> None:
-    """Raise ValueError if ``reset`` was given an option: there are none."""
-    if options:
-        raise ArgumentError(f"unknown reset option '{next(iter(options))}': plab's environments have none")
-
-
 def check_render_mode(render_mode: str | None) -> str | None:
     """Return a render mode; ValueError if there is none of this name."""
     modes = METADATA["render_modes"]
@@ -119,17 +167,32 @@ class Transition:
     Attributes:
         observation: Observations, shape [batch, entry], float32, or by key.
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
-        truncated: Whether the episodes are over.
-        info: The entries of ``info``, each of shape [batch], in type like the rewards.
+        terminated: Whether episodes have ended in success, shape [batch], on the host.
+        truncated: Whether episodes have reached the horizon, shape [batch], on the host.
+        info: The entries of ``info``, each of shape [batch], in type like the rewards; what was drawn is
+            under ``randomized``, by key, on the host.
         failures: Environments that have broken off in the episode, with time and reason; their numbers are
             those of the step before. Empty if the step was ``strict``.
     """
 
     observation: Array
     reward: Array
-    truncated: bool
-    info: dict[str, Array]
+    terminated: np.ndarray
+    truncated: np.ndarray
+    info: dict[str, Any]
     failures: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def over(self) -> np.ndarray:
+        """Whether episodes have ended, for whatever reason, shape [batch]."""
+        return self.terminated | self.cut_off
+
+    @property
+    def cut_off(self) -> np.ndarray:
+        """Whether episodes have reached the horizon or broken off, shape [batch]."""
+        broken = np.zeros_like(self.truncated)
+        broken[list(self.failures)] = True
+        return self.truncated | broken
 
 
 @dataclass(frozen=True)
@@ -137,33 +200,43 @@ class EpisodeState:
     """State of a batch between two steps, see :meth:`EpisodeBatch.get_state`.
 
     Attributes:
-        step: Steps taken in the episodes; None before the first :meth:`EpisodeBatch.reset`.
+        steps: Steps taken in the episodes, shape [batch]; None before the first :meth:`EpisodeBatch.reset`.
         simulation: Particles and manipulators, shape [batch, ...] each.
         failures: Environments that have broken off.
-        last: Observations, loss terms and IoU of the last step that was not ``strict``.
+        last: Observations, loss terms and IoU of the last step.
+        seeds: Entropy of the environments' draws.
+        episodes: Numbers of the episodes, shape [batch].
+        over: Which episodes have ended by a success or at the horizon, shape [batch].
+        values: What was drawn for each environment, by key.
+        starts: Losses and soft IoUs of the initial states, shape [2, batch].
     """
 
-    step: int | None
+    steps: np.ndarray | None
     simulation: State
     failures: Mapping[int, str]
     last: tuple[Any, ...]
+    seeds: tuple[tuple[int, ...], ...]
+    episodes: np.ndarray
+    over: np.ndarray
+    values: tuple[Values, ...]
+    starts: np.ndarray
 
 
 class EpisodeBatch:
-    """Sub-environments in one simulator, all in the same step of their episodes.
+    """Sub-environments in one simulator, which advances them together.
 
     Attributes:
         configs: One configuration per sub-environment.
         contact: Contact model of the episodes, ``hard`` or ``soft``.
         size: Number of sub-environments.
         horizon: Steps of an episode.
+        draws: What the episodes draw.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
-        picture_size: Width and height of pictures [pixels], to be set before the first.
-        picture_target: Whether pictures show the target, as a ghost; likewise.
         listener: Called with the actions and the result of each step; None if nothing listens.
     """
 
+    @_alone
     def __init__(
         self,
         cfgs: Sequence[Config],
@@ -171,19 +244,30 @@ class EpisodeBatch:
         contact: str = "hard",
         observe: str | Sequence[str] = "state",
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
+        randomize: Mapping[str, Any] | None = None,
+        success_score: float = 0.9,
+        terminate_on_success: bool = False,
+        render_size: tuple[int, int] = (480, 360),
+        render_target: bool = False,
     ) -> None:
         """Build everything; the episodes start at :meth:`reset`.
 
         Args:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
             contact: Contact model, ``hard`` or ``soft``.
-            observe: One of ``state``, ``particles``, ``depth``, ``rgb`` and ``segmentation``; or several,
-                which makes observations a dictionary with keys such as ``state`` and ``front_depth``.
-            cameras: Cameras of pictures by name, or their attributes; one named ``front`` if None.
+            observe: One of :data:`plab.envs.observations.OBSERVATIONS`; or several, which makes observations
+                a dictionary with keys such as ``state`` and ``front_depth``.
+            cameras: Cameras by name, or their attributes; those of the task if None, or one named ``front``.
+            randomize: Ranges of what each episode draws, in place of the tasks' own, see
+                :mod:`plab.config.draws`; empty: nothing.
+            success_score: Score from which on a state is a success.
+            terminate_on_success: Whether a success ends the episode.
+            render_size: Width and height of pictures [pixels].
+            render_target: Whether pictures show the target, as a ghost.
 
         Raises:
             ValueError: If the contact model or an observation does not exist.
-            plab.config.ConfigError: If the configurations do not fit together.
+            plab.config.ConfigError: If the configurations do not fit together, or a range does not do.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
             plab.sim.DeviceError: If CUDA was asked for and is not there.
@@ -192,17 +276,23 @@ class EpisodeBatch:
         if contact not in CONTACTS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
         _require_alike(cfgs)
+        self._randomize, self._success_score = randomize, success_score
+        self._terminates = terminate_on_success
+        cfgs = self._ranged(cfgs)
         problem = Problem(cfgs)
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
-        self.picture_size, self.picture_target = PICTURE_SIZE, False
+        self._picture_size, self._picture_target = render_size, render_target
         self._renderers: list[Renderer] = []
         self.listener: Callable[[Array, Transition], None] | None = None
         self._take(cfgs, problem)
-        state_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
-        self._sensors = Sensors(observe, cameras, problem.simulator, state_space)
+        state_space, self.action_space = spaces(cfgs[0], [*self.problem.scenes, *self.draws.scenes])
+        cameras = (cfgs[0].task.cameras or None) if cameras is None else cameras
+        points = min(cfgs[0].observe_particles, problem.simulator.particle_count)
+        self._sensors = Sensors(observe, cameras, problem.simulator, state_space, points)
         self.observation_space = self._sensors.space
         self._begin()
 
+    @_alone
     def renew(self, cfgs: Sequence[Config]) -> None:
         """Replace the sub-environments by others of the same kind, without compiling; the episodes start at
         :meth:`reset`.
@@ -219,9 +309,10 @@ class EpisodeBatch:
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
         _require_alike([*self.configs[:1], *cfgs])
+        cfgs = self._ranged(cfgs)
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
-        if kinds_of(cfgs) != kinds_of(self.configs):
+        if self.draws.changed or kinds_of(cfgs) != kinds_of(self.configs):
             # After an error half way, the batch belongs to no configurations.
             self.configs: tuple[Config, ...] = ()
             simulator.set_scenes(scenes)
@@ -230,21 +321,42 @@ class EpisodeBatch:
         self._sensors.refresh()
         self._begin()
 
+    def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
+        """Return configurations, one object where they are alike, with the ranges to draw from."""
+        unique = {id(cfg): cfg for cfg in cfgs}
+        for key, cfg in unique.items():
+            if self._randomize is not None:
+                cfg = replace(cfg, task=replace(cfg.task, randomize=dict(self._randomize)))
+                cfg.check()
+            unique[key] = with_own_materials(cfg)
+        return [unique[id(cfg)] for cfg in cfgs]
+
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
         self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
+        self.draws = Draws(cfgs, problem)
         self._observer = Observer(problem, cfgs[0])
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
         """Observe the initial states; no episode has started."""
-        self._step: int | None = None
+        self._steps: np.ndarray | None = None
+        self._over = np.zeros(self.size, bool)
+        # Of environments with the same configuration, each has draws of its own.
+        ids = [id(cfg) for cfg in self.configs]
+        self._seeds = [(cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)]
+        self._episodes = np.full(self.size, -1)
+        self._simulator.reset()
+        self._observe_starts()
+
+    def _observe_starts(self) -> None:
+        """Measure and observe the initial states of all environments, in which they are."""
         self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
         # Observations, loss terms and IoU of the last step, which environments that break off keep.
         self._initial = self._last = self._seen()
-        self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
+        self._initial_loss = Constants(self.problem.loss_of(self._initial[1]))
 
     @property
     def problem(self) -> Problem:
@@ -258,19 +370,42 @@ class EpisodeBatch:
         return self._problem
 
     @property
+    def over(self) -> np.ndarray:
+        """Which episodes have ended and are to be reset, shape [batch]."""
+        over = self._over.copy()
+        over[list(self._failures)] = True
+        return over
+
+    @property
     def _simulator(self) -> Simulator:
         return self.problem.simulator
 
-    def reset(self, like: torch.Tensor | None = None) -> tuple[Any, dict[str, Any]]:
-        """Put all sub-environments into their initial states.
+    @_alone
+    def reset(
+        self,
+        like: torch.Tensor | None = None,
+        *,
+        environments: Sequence[int] | np.ndarray | None = None,
+        seeds: Sequence[int] | None = None,
+        episode: int | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the next episodes of all sub-environments, or of some.
 
         Args:
             like: Given a CUDA tensor, everything returned is one too.
+            environments: Numbers of those that start an episode; all if None.
+            seeds: Seed of each of these, from which its draws begin anew; if None they go on.
+            episode: Number of the episodes, of which the draws depend; the next if None.
+            options: Values by dotted key of the task in place of what is drawn, for all of these or, with a
+                first axis of the batch's length, one for each.
 
         Returns:
-            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch].
+            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch]; of
+            the others those of their last step.
 
         Raises:
+            ValueError: If an option does not fit.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         if self._simulator.changes != self._changes:
@@ -278,15 +413,57 @@ class EpisodeBatch:
             self.problem.refresh()
             self._observer = Observer(self.problem, self.configs[0])
             self._sensors.refresh()
-            self._begin()
-        self._simulator.reset()
-        self._step, self._failures = 0, {}
-        self._last = self._seen(like) if on_device(like) else self._initial
+            self._observe_starts()
+        rows = list(range(self.size) if environments is None else map(int, environments))
+        if seeds is not None:
+            for e, seed in zip(rows, seeds, strict=True):
+                self._seeds[e], self._episodes[e] = (int(seed),), -1
+        numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
+        entropy = [(*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)]
+        changed = self.draws.redraw(rows, entropy, options or {})
+        self._episodes[rows] = numbers
+        if self._steps is None:
+            self._steps = np.zeros(self.size, int)
+        self._steps[rows], self._over[rows] = 0, False
+        self._failures = {e: text for e, text in self._failures.items() if e not in rows}
+        self._simulator.reset(None if environments is None else rows)
+        before = self._last
+        if changed or self.draws.changed or environments is not None or on_device(like):
+            measures = self._simulator.measure(like)
+            if changed:
+                self._note_starts(rows, measures.terms, measures.iou)
+            self._last = self._observe(like), measures.terms, measures.iou
+        else:
+            self._last = self._initial
+        self._keep(before, [e for e in range(self.size) if e not in rows])
         # Copies: a caller may keep and change what it is given.
-        observation, terms, iou = _copies(self._last)
-        return observation, self._info(terms, iou)
+        observation, terms, iou = self._last = _copies(self._last)
+        return mapped(_copy, observation), self._info(terms, iou)
 
-    def step(self, actions: Array, *, strict: bool = True) -> Transition:
+    def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
+        """Score and reward environments by the initial states, in which they are."""
+        self._changes = self._simulator.changes
+        self._close_renderers()
+        self._sensors.refresh()
+        self.problem.note_starts(rows, _on_host(iou))
+        loss = self._initial_loss.like(None).copy()
+        loss[rows] = _on_host(self.problem.loss_of(terms))[rows]
+        self._initial_loss = Constants(loss)
+        self._observer = Observer(self.problem, self.configs[0])
+
+    def _keep(self, before: tuple[Array, ...], rows: Sequence[int]) -> None:
+        """Keep the last observations and measures of some environments."""
+        if rows:
+            for table, old in zip(self._last, before, strict=True):
+                mapped(lambda now, then: _restore_rows(now, then, rows), table, old)
+
+    def require_going(self, idle: np.ndarray | None = None) -> None:
+        """Raise ResetNeeded if an episode has ended, also by breaking off, except ``idle`` ones."""
+        if np.any(self.over if idle is None else self.over & ~idle):
+            raise ResetNeeded("the episode is over: call reset() before step()")
+
+    @_alone
+    def step(self, actions: Array, *, strict: bool = True, idle: np.ndarray | None = None) -> Transition:
         """Advance all sub-environments by one step.
 
         Args:
@@ -295,16 +472,19 @@ class EpisodeBatch:
             strict: Whether a sub-environment that breaks off is an error. Otherwise, the same for all steps
                 of an episode, it is an entry in ``failures`` and keeps its last numbers while the others go
                 on; :meth:`reset` restores it.
+            idle: Which sub-environments are over and about to be reset, shape [batch]; their numbers mean
+                nothing.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
+            gymnasium.error.ResetNeeded: If no episode has been started, or one is over.
             plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
-        simulator, now = self._simulator, self._now()
+        simulator, steps = self._simulator, self._taken(idle=idle)
         # The measures report faults, too: checking here would wait for the device twice.
         simulator.step(actions, check=False)
+        self._steps = steps + 1
         # Queued before the wait for the measures.
         observation = self._observe(actions)
         try:
@@ -314,28 +494,44 @@ class EpisodeBatch:
                 raise
             # Raised once a step: the second call returns the measures of the others.
             self._failures, measures = error.failures | self._failures, simulator.measure(actions)
-        seen = observation, measures.terms, measures.iou
-        if self._failures:
-            for table, before in zip(seen, self._last, strict=True):
-                mapped(lambda now, then: _restore_rows(now, then, list(self._failures)), table, before)
-        if not strict:
-            self._last = _copies(seen)
-        self._step = now + 1
-        info = self._info(*seen[1:])
+        before, self._last = self._last, (observation, measures.terms, measures.iou)
+        self._keep(before, list(self._failures))
+        observation, terms, iou = _copies(self._last)
+        info = self._info(terms, iou)
         reward = self._initial_loss.like(actions) - info["loss"]
-        result = Transition(observation, reward, self._step == self.horizon, info, dict(self._failures))
+        terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
+        truncated = self._steps == self.horizon
+        self._over = terminated | truncated
+        done = Transition(observation, reward, terminated, truncated, info, dict(self._failures))
         if self.listener is not None:
-            self.listener(actions, result)
-        return result
+            self.listener(actions, done)
+        return done
 
+    @_alone
     def get_state(self) -> EpisodeState:
         """Return a copy of the state, from which :meth:`set_state` continues: on the CPU with the same bits.
 
         Raises:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
-        return EpisodeState(self._step, self._simulator.state(), dict(self._failures), _copies(self._last))
+        simulation = self._simulator.state()
+        for e in self._failures:
+            # What has broken off rests: any state that is finite will do.
+            simulation.x[e], simulation.v[e], simulation.C[e], simulation.F[e] = 0.5, 0.0, 0.0, np.eye(3)
+        starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
+        return EpisodeState(
+            None if self._steps is None else self._steps.copy(),
+            simulation,
+            dict(self._failures),
+            _copies(self._last),
+            tuple(self._seeds),
+            self._episodes.copy(),
+            self._over.copy(),
+            tuple(self.draws.values),
+            np.array(starts),
+        )
 
+    @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Replace the state by one that :meth:`get_state` of a batch of the same kind has returned.
 
@@ -347,10 +543,19 @@ class EpisodeBatch:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         self._simulator.set_state(state.simulation)
-        self._step, self._failures, self._last = state.step, dict(state.failures), _copies(state.last)
-        observation, terms, iou = self._seen()
+        if self.draws.put(dict(enumerate(state.values))):
+            self._changes = self._simulator.changes
+            self.problem.note_starts(range(self.size), state.starts[1])
+            self._initial_loss = Constants(state.starts[0])
+            self._observer = Observer(self.problem, self.configs[0])
+        self._steps = None if state.steps is None else state.steps.copy()
+        self._over = state.over.copy()
+        self._failures, self._last = dict(state.failures), _copies(state.last)
+        self._seeds, self._episodes = list(state.seeds), state.episodes.copy()
+        observation, terms, iou = _copies(self._last)
         return observation, self._info(terms, iou)
 
+    @_alone
     def closed_loop(
         self,
         steps: int,
@@ -383,10 +588,11 @@ class EpisodeBatch:
             plab.sim.SimulationError: If a state, loss or gradient stops being finite.
             MemoryError: If the gradient does not fit the memory budget.
         """
-        now = self._now(steps)
+        taken = self._taken(steps)
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
-            return choose(t, self._observer(particles, poses))
+            seen = self._observer(particles, poses)
+            return choose(t, self._noisy(seen, taken + t))
 
         def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
             bar = react(t, actions_bar)
@@ -395,16 +601,19 @@ class EpisodeBatch:
         terms = self._simulator.closed_loop(
             steps, chosen, reaction, stride=self._observer.stride, discount=discount, like=like
         )
-        self._step = now + steps
+        self._steps = taken + steps
         return terms
 
-    def _now(self, steps: int = 1) -> int:
-        """Return the index of the next step; ResetNeeded if fewer steps are left."""
-        if self._step is None or self._step + steps > self.horizon:
-            what = "no episode has started" if self._step is None else "the episode is over"
-            raise ResetNeeded(f"{what}: call reset() before step()")
-        return self._step
+    def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
+        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if one has fewer left."""
+        if self._steps is None:
+            raise ResetNeeded("no episode has started: call reset() before step()")
+        over = self._over | (self._steps + steps > self.horizon)
+        if np.any(over if idle is None else over & ~idle):
+            raise ResetNeeded("the episode is over: call reset() before step()")
+        return self._steps
 
+    @_alone
     def frames(self) -> tuple[np.ndarray, ...]:
         """Draw the current states.
 
@@ -417,8 +626,8 @@ class EpisodeBatch:
             from plab.render import Renderer
 
             for scene, mass in zip(self.problem.scenes, self.problem.target_mass, strict=True):
-                target = mass if self.picture_target else None
-                self._renderers.append(Renderer(scene, target, self.picture_size))
+                target = mass if self._picture_target else None
+                self._renderers.append(Renderer(scene, target, self._picture_size))
         x, poses = simulator.observe(1)[..., :3], simulator.poses()
         return tuple(r.frame(x[e], poses[e]) for e, r in enumerate(self._renderers))
 
@@ -427,33 +636,48 @@ class EpisodeBatch:
         self._close_renderers()
         self._problem = None
         self._sensors.release()
+        self.draws.release()
 
     def _close_renderers(self) -> None:
         for renderer in self._renderers:
             renderer.close()
         self._renderers = []
 
-    def _observe(self, like: Array = None) -> Array:
+    def _observe(self, like: Array = None) -> Any:
         def state() -> Array:
             seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
             joined = self._observer(*seen, np.float32)
             return joined.float() if on_device(joined) else joined
 
-        return self._sensors(state, like)
+        observation = self._sensors(state, like)
+        return observation if self._steps is None else self._noisy(observation, self._steps)
+
+    def _noisy(self, observation: Any, steps: np.ndarray) -> Any:
+        """Add the noise that the environments have drawn to observations before a step."""
+        if not (deviations := self.draws.noise()).any():
+            return observation
+        rngs = [
+            np.random.default_rng([*seed, int(episode), int(step), 1])
+            for seed, episode, step in zip(self._seeds, self._episodes, steps, strict=True)
+        ]
+        return self._sensors.noisy(observation, deviations, rngs, self._observer.constant)
 
     def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
         """Return observations, loss terms and IoU of the current states."""
         measures = self._simulator.measure(like)
         return self._observe(like), measures.terms, measures.iou
 
-    def _info(self, terms: Array, iou: Array) -> dict[str, Array]:
+    def _info(self, terms: Array, iou: Array) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
+        drawn = self.draws.info()
         return {
             "loss": self.problem.loss_of(terms),
             **{f"loss_{name}": terms[:, k] for k, name in enumerate(self.problem.term_names)},
             "iou": iou,
             "score": score,
             "score_printed": printed,
+            "success": score >= self._success_score,
+            **({"randomized": drawn} if drawn else {}),
         }
 
 
@@ -479,7 +703,19 @@ class Restorable:
         """Build the environment anew, and put it into the state."""
         self.__init__(**kept["arguments"])  # type: ignore[misc]
         self.batch.set_state(kept["state"])
+        self._is_seeded = True
         self._np_random, self._np_random_seed = kept["random"]
+
+    def _first_seeds(self, seed: int | Sequence[int] | None) -> Sequence[int] | None:
+        """Return the seeds of the sub-environments' draws, from ``np_random`` where none was ever given; None
+        if the draws go on."""
+        count = self.batch.size
+        if seed is None and not self._is_seeded:
+            seed = [int(one) for one in self.np_random.integers(2**31, size=count)]  # type: ignore[attr-defined]
+        self._is_seeded = True
+        return [seed + e for e in range(count)] if isinstance(seed, int) else seed
+
+    _is_seeded = False
 
     def get_state(self) -> EpisodeState:
         """Return a copy of the state of the episodes; see :meth:`EpisodeBatch.get_state`."""
@@ -498,11 +734,26 @@ def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
     kept = before[rows]
     if on_device(table):
         kept = kept.to(table) if on_device(kept) else table.new_tensor(kept)
-    table[rows] = kept
+    table[rows] = kept if on_device(table) else _on_host(kept)
 
 
 def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:
-    def copy(table: Array) -> Array:
-        return table.clone() if on_device(table) else table.copy()
+    return tuple(mapped(_copy, table) for table in tables)
 
-    return tuple(mapped(copy, table) for table in tables)
+
+def _copy(table: Array) -> Array:
+    return table.clone() if on_device(table) else table.copy()
+
+
+def _on_host(table: Array) -> np.ndarray:
+    return table.cpu().numpy() if on_device(table) else np.asarray(table)
+
+
+def info_of(transition_info: Mapping[str, Any], e: int, failures: Mapping[int, str]) -> dict[str, Any]:
+    """Return the ``info`` of one sub-environment, with ``failure``, the reason, if it has broken off."""
+
+    def one(values: np.ndarray) -> Any:
+        return values[e].item() if values.ndim == 1 else values[e]
+
+    info = {name: mapped(one, values) for name, values in transition_info.items()}
+    return info | ({"failure": failures[e]} if e in failures else {})

@@ -21,7 +21,7 @@ __all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "sp
 
 PICTURES = ("depth", "rgb", "segmentation")
 
-OBSERVATIONS = ("state", "particles", *PICTURES)
+OBSERVATIONS = ("state", "particles", "points", *PICTURES)
 """Names of what can be observed."""
 
 DEFAULT_CAMERAS = {"front": Camera((0.5, 0.9, 1.7), (0.5, 0.15, 0.5), 45.0)}
@@ -36,6 +36,7 @@ class Observer:
 
     Attributes:
         stride: Every so many-th particle is observed.
+        constant: Last entries of an observation that do not change in an episode.
     """
 
     def __init__(self, problem: Problem, cfg: Config) -> None:
@@ -45,6 +46,7 @@ class Observer:
         self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
         self._numbers = len(scene.manipulators) * 8
         size = len(problem.scenes)
+        self.constant = TARGET_ENTRIES if cfg.observe_target else 0
         self._target = Constants(_target_observations(problem) if cfg.observe_target else np.empty((size, 0)))
 
     def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
@@ -65,6 +67,64 @@ class Observer:
         return bar[:, :particles].reshape(size, self._count, 6), whole.reshape(size, -1, 8)
 
 
+class SurfacePoints:
+    """Particles at the surface of bodies.
+
+    Those have an empty cell beside theirs, in a coarse grid of which every cell inside a body holds some.
+    """
+
+    CELL = 2.5
+    """Edge of a cell [mean particle spacings]."""
+
+    def __init__(self, simulator: Simulator, count: int) -> None:
+        """Take over a simulator, whose states are observed, and the number of points."""
+        self._simulator, self._count = simulator, count
+        body = simulator.scenes[0].bodies[0]
+        self._spacing = (body.volume / body.particles) ** (1 / 3)
+
+    def __call__(self, cameras: Sequence[CameraSensor], like: Array) -> Array:
+        """Return points of the current states, shape [batch, point, 3], float32, with a fourth entry if there
+        are cameras: 1 where one of them sees the point, else 0. Where the surface has fewer particles, others
+        follow them. A CUDA tensor if ``like`` is one."""
+        import torch
+
+        x = torch.as_tensor(self._simulator.observe(1, like)[..., :3]).float()
+        edge = self.CELL * self._spacing
+        nodes = int(1.0 / edge) + 4
+        cell = (x / edge).floor().long().clamp(-1, nodes - 3) + 1
+        flat = (cell[..., 0] * nodes + cell[..., 1]) * nodes + cell[..., 2]
+        occupied = torch.zeros((len(x), nodes**3), dtype=torch.bool, device=x.device)
+        occupied.scatter_(1, flat, True)
+        inside = torch.ones_like(flat, dtype=torch.bool)
+        for way in (1, nodes, nodes * nodes):
+            for side in (-way, way):
+                inside &= occupied.gather(1, (flat + side).clamp(0, nodes**3 - 1))
+        # Particles of a body are in random order: the first ones are spread over its surface.
+        first = inside.byte().argsort(dim=1, stable=True)[:, : self._count]
+        points = x.gather(1, first[..., None].expand(-1, -1, 3))
+        if cameras:
+            seen = torch.stack([self._sees(sensor, points, like) for sensor in cameras]).any(0)
+            points = torch.cat([points, seen[..., None].float()], dim=2)
+        return points if on_device(like) else points.numpy()
+
+    def _sees(self, sensor: CameraSensor, points: Any, like: Array) -> Any:
+        """Return which points, shape [batch, point, 3], nothing hides from a camera."""
+        import torch
+
+        camera = sensor.camera
+        depth = torch.as_tensor(sensor.capture("depth", like=like)["depth"])
+        axes, position = (points.new_tensor(part) for part in (camera.axes(), camera.position))
+        right, up, back = ((points - position) @ axes.T).unbind(-1)
+        width, height = camera.size
+        away = -back.clamp(max=-1e-6)
+        column = (width / 2 + camera.focal_length * right / away).floor().long()
+        row = (height / 2 - camera.focal_length * up / away).floor().long()
+        within = (back < 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+        nearest = depth.reshape(len(points), -1).gather(1, pixel)
+        return within & (away < nearest + 2.0 * self._spacing)
+
+
 class Sensors:
     """Observations by key: of the state, of particles, and pictures of cameras.
 
@@ -79,14 +139,17 @@ class Sensors:
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None,
         simulator: Simulator,
         state_space: Box,
+        points: int,
     ) -> None:
         """Choose what is observed.
 
         Args:
             observe: One of :data:`OBSERVATIONS`, or several.
-            cameras: Cameras of pictures by name, or their attributes; :data:`DEFAULT_CAMERAS` if None.
+            cameras: Cameras by name, or their attributes; :data:`DEFAULT_CAMERAS` if None and pictures are
+                observed.
             simulator: Whose state is observed.
             state_space: Space of ``state``.
+            points: Number of ``points``.
 
         Raises:
             ValueError: If there is no such observation, or nothing to observe.
@@ -95,17 +158,22 @@ class Sensors:
         if unknown := [name for name in self.names if name not in OBSERVATIONS]:
             raise ArgumentError(f"observe '{unknown[0]}' is not one of {', '.join(OBSERVATIONS)}")
         self._pictures = [name for name in self.names if name in PICTURES]
-        given = (DEFAULT_CAMERAS if cameras is None else cameras) if self._pictures else {}
+        if not cameras:
+            cameras = DEFAULT_CAMERAS if self._pictures and cameras is None else {}
         self.cameras = {
-            name: one if isinstance(one, Camera) else Camera(**one) for name, one in given.items()
+            name: one if isinstance(one, Camera) else Camera(**one) for name, one in cameras.items()
         }
         if not self.names or (self._pictures and not self.cameras):
             raise ArgumentError("nothing is observed: name observations, and cameras for pictures")
         self._simulator: Simulator | None = simulator
-        self._cameras = {name: CameraSensor(simulator, camera) for name, camera in self.cameras.items()}
+        looking = self._pictures or "points" in self.names
+        self._cameras = {name: CameraSensor(simulator, one) for name, one in self.cameras.items() if looking}
         spaces: dict[str, Space[Any]] = {"state": state_space} if "state" in self.names else {}
         if "particles" in self.names:
             spaces["particles"] = Box(0.0, 1.0, (simulator.particle_count, 3), np.float32)
+        if "points" in self.names:
+            self._points = SurfacePoints(simulator, points)
+            spaces["points"] = Box(0.0, 1.0, (points, 4 if self._cameras else 3), np.float32)
         for name, camera in self.cameras.items():
             width, height = camera.size
             known: dict[str, Space[Any]] = {
@@ -117,9 +185,11 @@ class Sensors:
         self._alone = isinstance(observe, str) and len(spaces) == 1
         self.space = next(iter(spaces.values())) if self._alone else Dict(spaces)
 
+    _points: SurfacePoints | None = None
+
     def release(self) -> None:
         """Let go of the simulator and its memory."""
-        self._simulator, self._cameras = None, {}
+        self._simulator, self._cameras, self._points = None, {}, None
 
     def refresh(self) -> None:
         """Follow a change of the simulator's scenes."""
@@ -133,10 +203,47 @@ class Sensors:
         if "particles" in self.names:
             x = cast(Simulator, self._simulator).observe(1, like)[..., :3]
             out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
-        for name, sensor in self._cameras.items():
+        if self._points is not None:
+            out["points"] = self._points(list(self._cameras.values()), like)
+        for name, sensor in self._cameras.items() if self._pictures else ():
             for picture, values in sensor.capture(*self._pictures, like=like).items():
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
         return next(iter(out.values())) if self._alone else out
+
+    def noisy(
+        self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
+    ) -> Any:
+        """Return observations with Gaussian noise, within their space; colours and labels have none.
+
+        Args:
+            observation: Observations of a batch.
+            deviations: Standard deviations, shape [batch].
+            rngs: Generators of the noise, one per environment: the same on every device and in every batch.
+            constant: Last entries of ``state`` that have none.
+        """
+
+        def one(name: str, values: Array, space: Box) -> Array:
+            if name.endswith(("rgb", "segmentation")):
+                return values
+            noise = np.stack([rng.standard_normal(space.shape, np.float32) for rng in rngs])
+            noise *= deviations.astype(np.float32).reshape(-1, *[1] * len(space.shape))
+            if name == "state" and constant:
+                noise[:, -constant:] = 0.0
+            if name == "points":
+                noise[..., 3:] = 0.0
+            low, high = space.low, space.high
+            if on_device(values):
+                noise, low, high = (values.new_tensor(part) for part in (noise, low, high))
+            seen = values + noise
+            if name.endswith("depth"):
+                # Where nothing is seen, nothing is measured.
+                seen = seen * (values < high) + values * (values >= high)
+            return seen.clip(low, high)
+
+        if self._alone:
+            return one(self.names[0], observation, cast(Box, self.space))
+        spaces = cast(Dict, self.space).spaces
+        return {name: one(name, values, cast(Box, spaces[name])) for name, values in observation.items()}
 
 
 def mapped(function: Callable[..., Any], *observations: Any) -> Any:

@@ -13,47 +13,22 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from plab.envs import ENTRY_POINT
-from plab.envs.core import (
-    METADATA,
-    PICTURE_SIZE,
-    EpisodeBatch,
-    check_render_mode,
-    compose_configs,
-    refuse_options,
-)
+from plab.envs.core import METADATA, EpisodeBatch, check_render_mode, info_of, make_batch
 from plab.envs.observations import mapped
 from plab.errors import ArgumentError
-from plab.scenes import Camera
 
 __all__ = ["PlabVecEnv", "make_sb3"]
 
 
-def make_sb3(
-    env_id: str,
-    num_envs: int = 1,
-    *,
-    contact: str = "hard",
-    observe: str | Sequence[str] = "state",
-    cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
-    render_mode: str | None = None,
-    render_size: tuple[int, int] = PICTURE_SIZE,
-    render_target: bool = False,
-    **kwargs: Any,
-) -> PlabVecEnv:
+def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> PlabVecEnv:
     """Make the environments of a registered id.
 
     Args:
         env_id: Such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
-        contact: Contact model, ``hard`` or ``soft``.
-        observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names need a policy for
-            dictionaries, such as ``MultiInputPolicy``.
-        cameras: Cameras of pictures by name.
         render_mode: ``rgb_array``, or None for no pictures.
-        render_size: Width and height of pictures [pixels].
-        render_target: Whether pictures show the target, as a ghost.
-        **kwargs: ``overrides``, ``overrides_per_env`` and ``config_dir``; see
-            :func:`plab.envs.core.compose_configs`.
+        **options: Arguments of :func:`plab.envs.core.make_batch` and :class:`plab.envs.core.EpisodeBatch`. If
+            several things are observed, the policy has to take dictionaries, as ``MultiInputPolicy`` does.
 
     Raises:
         gymnasium.error.Error: If there is no such id.
@@ -65,24 +40,23 @@ def make_sb3(
         raise ArgumentError(
             f"'{env_id}' is no environment of plab's: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
-    cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
-    batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
-    batch.picture_size, batch.picture_target = render_size, render_target
+    batch = make_batch(num_envs=num_envs, **spec.kwargs | options)
     return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
 
 
 class PlabVecEnv(VecEnv):
-    """Sub-environments that one simulator advances together, reset in the step that ends their episodes.
+    """Sub-environments that one simulator advances together, each reset in the step that ends its episode.
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if there is one.
-        strict: Whether a sub-environment that breaks off is an error; otherwise it keeps its last numbers
-            until its episode ends, see :meth:`plab.envs.core.EpisodeBatch.step`, and its infos hold the
-            reason under ``broken``.
+        together: Whether all episodes end together: one that breaks off rests until then, with the reason
+            under ``failure`` in its infos; otherwise it is truncated and reset at once.
+        next_episode: Number of the episodes that the next :meth:`reset` starts; that after the last if None.
     """
 
-    strict = True
+    together = False
+    next_episode: int | None = None
 
     def __init__(
         self, batch: EpisodeBatch, *, render_mode: str | None = None, spec: EnvSpec | None = None
@@ -104,15 +78,20 @@ class PlabVecEnv(VecEnv):
         super().__init__(batch.size, batch.observation_space, batch.action_space)
         self.metadata = dict(METADATA)
 
-    def reset(self) -> np.ndarray:
-        """Start the episodes; observations, shape [env, entry], float32. Their infos are in
-        ``reset_infos``."""
-        for options in self._options:
-            refuse_options(options)
-        observation, info = self.batch.reset()
-        self.reset_infos = self._split(info)
-        # The start is always the same, there is nothing to seed.
+    def reset(self) -> Any:
+        """Start the episodes; observations, shape [env, entry], float32, or by key. Their infos are in
+        ``reset_infos``. ``seed`` and ``set_options`` are those of :meth:`plab.envs.single.PlabEnv.reset`;
+        options are the same for all sub-environments."""
+        if any(options != self._options[0] for options in self._options):
+            raise ArgumentError(
+                "options differ between sub-environments: give values one per sub-environment"
+            )
+        seeds = None if None in self._seeds else self._seeds
+        observation, info = self.batch.reset(seeds=seeds, options=self._options[0], episode=self.next_episode)
+        self.next_episode = None
+        self.reset_infos = self._split(info, {})
         self._reset_seeds()
+        self._reset_options()
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -127,20 +106,24 @@ class PlabVecEnv(VecEnv):
 
         Raises:
             ValueError: If the actions' shape is wrong or one is not finite.
-            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
+            gymnasium.error.ResetNeeded: If no episode has been started.
         """
-        result = self.batch.step(self._actions, strict=self.strict)
-        observation, infos = result.observation, self._split(result.info)
-        for number, text in result.failures.items():
-            infos[number]["broken"] = text
+        if not self.together:
+            self.batch.require_going()
+        done = self.batch.step(self._actions, strict=False)
+        observation, infos = done.observation, self._split(done.info, done.failures)
+        over = done.truncated if self.together else done.over
         for number, info in enumerate(infos):
-            info["TimeLimit.truncated"] = result.truncated
-            if result.truncated:
+            info["TimeLimit.truncated"] = bool(over[number] and not done.terminated[number])
+            if over[number]:
                 info["terminal_observation"] = mapped(operator.itemgetter(number), observation)
-        if result.truncated:
-            observation, first = self.batch.reset()
-            self.reset_infos = self._split(first)
-        return observation, result.reward.astype(np.float32), np.full(self.num_envs, result.truncated), infos
+        if over.any():
+            rows = np.flatnonzero(over)
+            observation, first = self.batch.reset(environments=None if over.all() else rows)
+            starts = self._split(first, {})
+            for number in rows:
+                self.reset_infos[number] = starts[number]
+        return observation, done.reward.astype(np.float32), over, infos
 
     def get_images(self) -> Sequence[np.ndarray]:
         """Return one picture per sub-environment, shape [height, width, 3], uint8."""
@@ -184,6 +167,6 @@ class PlabVecEnv(VecEnv):
         """Return False for every sub-environment: there is nothing to wrap."""
         return [False for _ in self._get_indices(indices)]
 
-    def _split(self, info: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    def _split(self, info: Mapping[str, Any], failures: Mapping[int, str]) -> list[dict[str, Any]]:
         """Return one info per sub-environment."""
-        return [{name: float(v[e]) for name, v in info.items()} for e in range(self.num_envs)]
+        return [info_of(info, e, failures) for e in range(self.num_envs)]

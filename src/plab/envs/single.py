@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+import copy
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike
 
-from plab.envs.core import (
-    METADATA,
-    PICTURE_SIZE,
-    EpisodeBatch,
-    EpisodeState,
-    Restorable,
-    check_render_mode,
-    compose_configs,
-    refuse_options,
-)
+from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, info_of, make_batch
 from plab.envs.observations import mapped
-from plab.scenes import Camera
 
 __all__ = ["PlabEnv"]
 
@@ -29,8 +20,8 @@ __all__ = ["PlabEnv"]
 class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     """A task as a Gymnasium environment.
 
-    The start is always the same, so that the seed of :meth:`reset` only seeds ``np_random``. An episode is
-    truncated after ``sim.horizon`` steps, and never terminates.
+    An episode is truncated after ``sim.horizon`` steps, or where the simulation breaks off, with the reason
+    in ``info["failure"]``. Every start is the same, unless the task says what to draw.
 
     Attributes:
         batch: The episode, a batch of one, with its scene, target and simulator.
@@ -39,87 +30,83 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     metadata: ClassVar[dict[str, Any]] = dict(METADATA)  # type: ignore[misc]
 
     def __init__(
-        self,
-        task: str,
-        variant: str = "1",
-        *,
-        overrides: Sequence[str] = (),
-        contact: str = "hard",
-        observe: str | Sequence[str] = "state",
-        cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
-        config_dir: str | Path | None = None,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = PICTURE_SIZE,
-        render_target: bool = False,
+        self, task: str, variant: str = "1", *, render_mode: str | None = None, **options: Any
     ) -> None:
         """Build the environment.
 
         Args:
             task: Name of the task.
             variant: Name of its variant.
-            overrides: Overrides of the configuration, as on the command line: ``["sim.device=cuda"]``.
-            contact: Contact model, ``hard`` or ``soft``.
-            observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names make it a
-                dictionary.
-            cameras: Cameras of pictures by name.
-            config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
-            render_size: Width and height of pictures [pixels].
-            render_target: Whether pictures show the target, as a ghost.
+            **options: Arguments of :func:`plab.envs.core.make_batch` and
+                :class:`plab.envs.core.EpisodeBatch`: ``overrides``, ``config_dir``, ``contact``, ``observe``,
+                ``cameras``, ``randomize``, ``success_score``, ``terminate_on_success``, ``render_size`` and
+                ``render_target``.
 
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
         """
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}
         self.render_mode = check_render_mode(render_mode)
-        cfgs = compose_configs(task, variant, overrides=overrides, config_dir=config_dir)
-        self.batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
-        self.batch.picture_size, self.batch.picture_target = render_size, render_target
+        self.batch = make_batch(task, variant, **options)
         self.observation_space = self.batch.observation_space
         self.action_space = self.batch.action_space
 
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's specification; its ``max_episode_steps`` is ``sim.horizon``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = copy.copy(value)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.batch.horizon
+
+    _spec: EnvSpec | None = None
+
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, float]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
 
         Args:
-            seed: Seed of ``np_random``; the start does not depend on it.
-            options: None, there are none.
+            seed: Seed of ``np_random`` and of what this episode and the next ones draw.
+            options: Values by dotted key of the task in place of what is drawn, for this episode.
 
         Returns:
-            Observation, shape [entry], float32, and ``info``.
+            Observation, shape [entry], float32, or by key, and ``info``.
 
         Raises:
-            ValueError: If an option is given.
+            ValueError: If an option does not fit.
         """
-        refuse_options(options)
         super().reset(seed=seed)
-        observation, info = self.batch.reset()
-        return _first(observation), _only(info)
+        seeds = self._first_seeds(seed)
+        observation, info = self.batch.reset(seeds=seeds, options=options)
+        return _first(observation), info_of(info, 0, {})
 
-    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, float]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one step.
 
         Args:
             action: Action, shape [action]; clipped to [-1, 1].
 
         Returns:
-            Observation, reward, whether terminated (never), whether truncated, and ``info``.
+            Observation, reward, whether terminated, whether truncated, and ``info``.
 
         Raises:
             ValueError: If the shape is wrong or an entry is not finite.
             gymnasium.error.ResetNeeded: If the episode is over.
-            plab.sim.SimulationError: If the state stops being finite.
         """
-        result = self.batch.step(np.asarray(action)[None])
-        observation, reward = _first(result.observation), float(result.reward[0])
-        return observation, reward, False, result.truncated, _only(result.info)
+        self.batch.require_going()
+        done = self.batch.step(np.asarray(action)[None], strict=False)
+        ends = bool(done.terminated[0]), bool(done.cut_off[0])
+        return _first(done.observation), float(done.reward[0]), *ends, info_of(done.info, 0, done.failures)
 
-    def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, float]]:
+    def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Replace the state by one of :meth:`get_state`; returns its observation and ``info``."""
         observation, info = self.batch.set_state(state)
-        return _first(observation), _only(info)
+        return _first(observation), info_of(info, 0, state.failures)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""
@@ -136,8 +123,3 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
 def _first(observation: Any) -> Any:
     """Return the observation of a batch of one."""
     return mapped(lambda rows: rows[0], observation)
-
-
-def _only(info: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return the ``info`` of a batch of one."""
-    return {name: float(values[0]) for name, values in info.items()}

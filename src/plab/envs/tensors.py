@@ -26,7 +26,7 @@ def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
 
 
 class TensorEnv:
-    """A batch of episodes, all in the same step, with tensors in and out.
+    """A batch of episodes with tensors in and out.
 
     On CUDA the tensors are on the simulator's device, and nothing but the actions' check and the simulator's
     fault flags passes through the host.
@@ -42,9 +42,10 @@ class TensorEnv:
         self.device = torch.device(batch.problem.simulator.device)
         self._like = torch.empty(0, device=self.device)
 
-    def reset(self) -> Any:
-        """Put all environments into their initial states; returns observations, shape [batch, entry]."""
-        observation, _info = self.batch.reset(self._like)
+    def reset(self, **how: Any) -> Any:
+        """Start episodes; returns observations, shape [batch, entry], or by key. Arguments are those of
+        :meth:`plab.envs.core.EpisodeBatch.reset`."""
+        observation, _info = self.batch.reset(self._like, **how)
         return mapped(torch.as_tensor, observation)
 
     def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
@@ -57,7 +58,7 @@ class TensorEnv:
 
         Returns:
             Tensors; observations are float32, the others have the type of the actions, or the simulator's
-            precision if those are integers.
+            precision if those are integers. ``terminated``, ``truncated`` and what was drawn are arrays.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -68,6 +69,8 @@ class TensorEnv:
         if self.device.type == "cuda":
             return self.batch.step(actions, strict=strict)
         done = self.batch.step(actions.double().numpy(), strict=strict)
-        info = {name: torch.as_tensor(values).to(actions) for name, values in done.info.items()}
+        numbers = {name: values for name, values in done.info.items() if name != "randomized"}
+        info = {name: torch.as_tensor(values).to(actions) for name, values in numbers.items()}
+        info = done.info | info
         reward = torch.as_tensor(done.reward).to(actions)
         return replace(done, observation=mapped(torch.as_tensor, done.observation), reward=reward, info=info)

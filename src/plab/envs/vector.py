@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
@@ -13,19 +12,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from plab.envs.core import (
-    METADATA,
-    PICTURE_SIZE,
-    EpisodeBatch,
-    EpisodeState,
-    Restorable,
-    check_render_mode,
-    compose_configs,
-    refuse_options,
-)
+from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, make_batch
 from plab.envs.observations import mapped
 from plab.errors import ArgumentError
-from plab.scenes import Camera
 
 __all__ = ["PlabVectorEnv"]
 
@@ -33,8 +22,8 @@ __all__ = ["PlabVectorEnv"]
 class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     """Sub-environments that one simulator advances together.
 
-    All have the same horizon, hence their episodes end together. They are reset in the step that ends them
-    (``AutoresetMode.SAME_STEP``), and ``info`` holds ``final_obs`` and ``final_info`` then.
+    Episodes end as those of :class:`plab.envs.single.PlabEnv` do, each for itself. What happens then is up to
+    ``metadata["autoreset_mode"]``.
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
@@ -50,15 +39,9 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         *,
         task: str,
         variant: str = "1",
-        overrides: Sequence[str] = (),
-        overrides_per_env: Sequence[Sequence[str]] | None = None,
-        contact: str = "hard",
-        observe: str | Sequence[str] = "state",
-        cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
-        config_dir: str | Path | None = None,
         render_mode: str | None = None,
-        render_size: tuple[int, int] = PICTURE_SIZE,
-        render_target: bool = False,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        **options: Any,
     ) -> None:
         """Build the environments.
 
@@ -66,33 +49,28 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             num_envs: Number of sub-environments.
             task: Name of the task.
             variant: Name of its variant.
-            overrides: Overrides of the configuration of all sub-environments, as on the command line.
-            overrides_per_env: Further overrides, one list per sub-environment, such as
-                ``[["variant=1"], ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
-            contact: Contact model, ``hard`` or ``soft``.
-            observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names make it a
-                dictionary.
-            cameras: Cameras of pictures by name.
-            config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
-            render_size: Width and height of pictures [pixels].
-            render_target: Whether pictures show the target, as a ghost.
+            autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``SameStep`` resets in the
+                step that ends an episode, whose last observation is in ``infos["final_obs"]``; ``NextStep``
+                in the next step, which ignores the action; ``Disabled`` leaves it to :meth:`reset` with
+                ``options={"reset_mask": ...}``.
+            **options: Arguments of :func:`plab.envs.core.make_batch` and
+                :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and
+                ``overrides_per_env``.
 
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
         """
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
+        self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
         self.render_mode = check_render_mode(render_mode)
-        cfgs = compose_configs(
-            task,
-            variant,
-            num_envs=num_envs,
-            overrides=overrides,
-            overrides_per_env=overrides_per_env,
-            config_dir=config_dir,
-        )
-        self.batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
-        self.batch.picture_size, self.batch.picture_target = render_size, render_target
+        try:
+            self._mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            names = ", ".join(mode.value for mode in AutoresetMode)
+            raise ArgumentError(f"autoreset_mode '{autoreset_mode}' is not one of {names}") from None
+        self.metadata = METADATA | {"autoreset_mode": self._mode}  # type: ignore[misc]
+        self.batch = make_batch(task, variant, num_envs=num_envs, **options)
         self.num_envs = num_envs
         self.single_observation_space = self.batch.observation_space
         self.single_action_space = self.batch.action_space
@@ -100,56 +78,74 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the episodes of all sub-environments.
+        """Start episodes of the sub-environments.
 
         Args:
-            seed: Seed of ``np_random``; the starts do not depend on it.
-            options: None, or ``reset_mask``, all True.
+            seed: Seed of ``np_random`` and of what this episode and the next ones draw: sub-environment i has
+                ``seed + i``, or its own of a list.
+            options: Values by dotted key of the task in place of what is drawn, for all or one per
+                sub-environment; and ``reset_mask``, shape [env]: those that start an episode.
 
         Returns:
-            Observations, shape [env, entry], float32, and ``info``.
+            Observations, shape [env, entry], float32, or by key, and ``info``.
 
         Raises:
-            ValueError: If another option is given, or only some sub-environments are to be reset.
+            ValueError: If an option does not fit.
         """
-        rest = dict(options or {})
-        if not np.all(rest.pop("reset_mask", True)):
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ArgumentError(
-                "reset_mask must be True for all sub-environments: they share one simulator and end together"
+                f"reset_mask must be {self.num_envs} booleans, one at least True (got {mask})"
             )
-        refuse_options(rest)
-        super().reset(seed=seed)
-        observation, info = self.batch.reset()
-        return observation, self._masked(info)
+        super().reset(seed=seed if seed is None or isinstance(seed, int) else seed[0])
+        seeds = self._first_seeds(seed)
+        if seeds is not None:
+            seeds = [one for one, chosen in zip(seeds, mask, strict=True) if chosen]
+        return self._restarted(mask, seeds=seeds, options=given)
 
     def step(self, actions: ArrayLike) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all sub-environments by one step, and reset them if that ends their episodes.
+        """Advance all sub-environments by one step, or start the next episodes of those that have ended.
 
         Args:
             actions: Actions, shape [env, action]; clipped to [-1, 1].
 
         Returns:
-            Observations, rewards, whether terminated (never), whether truncated, and ``info``.
+            Observations, rewards, whether terminated, whether truncated, and ``info``.
 
         Raises:
             ValueError: If the shape is wrong or an entry is not finite.
-            plab.sim.SimulationError: If a state stops being finite.
+            gymnasium.error.ResetNeeded: If an episode is over, and no other is to be started.
         """
-        result = self.batch.step(np.asarray(actions))
-        observation, info = result.observation, self._masked(result.info)
-        if result.truncated:
-            ended = self._masked({"final_obs": _rows(observation, self.num_envs), "final_info": info})
-            observation, first = self.batch.reset()
-            info = ended | self._masked(first)
-        truncated = np.full(self.num_envs, result.truncated)
-        return observation, result.reward, np.zeros_like(truncated), truncated, info
+        idle = self.batch.over if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, bool)
+        if idle.all():
+            none = np.zeros(self.num_envs, bool)
+            observation, info = self._restarted(idle)
+            return observation, np.zeros(self.num_envs), none, none.copy(), info
+        self.batch.require_going(idle)
+        done = self.batch.step(np.asarray(actions), strict=False, idle=idle)
+        observation, reward = done.observation, np.where(idle, 0.0, done.reward)
+        terminated, truncated = done.terminated & ~idle, done.cut_off & ~idle
+        info = self._masked(done.info | self._failures(done.failures))
+        if idle.any():
+            observation, info = self._restarted(idle)
+        over = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP and over.any():
+            last = np.full(self.num_envs, None, object)
+            for e in np.flatnonzero(over):
+                last[e] = mapped(operator.itemgetter(e), observation)
+            final = done.info | self._failures(done.failures)
+            ended = self._masked({"final_obs": last, "final_info": self._masked(final, over)}, over)
+            observation, info = self._restarted(over)
+            info = ended | info
+        return observation, reward, terminated, truncated, info
 
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Replace the state by one of :meth:`get_state`; returns its observations and ``info``."""
         observation, info = self.batch.set_state(state)
-        return observation, self._masked(info)
+        return observation, self._masked(info | self._failures(state.failures))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
@@ -163,15 +159,28 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Release the simulator."""
         self.batch.close()
 
-    def _masked(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Add Gymnasium's masks, which say that every sub-environment has every entry."""
-        masks = {f"_{name}": np.ones(self.num_envs, bool) for name in info}
-        return info | masks
+    def _restarted(self, mask: np.ndarray, **how: Any) -> tuple[Any, dict[str, Any]]:
+        """Start the next episodes of some sub-environments; returns observations and ``info`` of all."""
+        observation, info = self.batch.reset(environments=None if mask.all() else np.flatnonzero(mask), **how)
+        return observation, self._masked(info)
 
+    def _failures(self, failures: Mapping[int, str]) -> dict[str, np.ndarray]:
+        texts = np.full(self.num_envs, None, object)
+        texts[list(failures)] = list(failures.values())
+        return {"failure": texts} if failures else {}
 
-def _rows(observations: Any, count: int) -> np.ndarray:
-    """Return the observation of each environment in an array of objects, the form of ``final_obs``."""
-    out = np.empty(count, object)
-    for number in range(count):
-        out[number] = mapped(operator.itemgetter(number), observations)
-    return out
+    def _masked(self, info: Mapping[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
+        """Add Gymnasium's masks, which say which sub-environments have an entry; others have 0."""
+        out: dict[str, Any] = {}
+        for name, values in info.items():
+            own = np.ones(self.num_envs, bool) if mask is None else mask.copy()
+            if isinstance(values, Mapping):
+                out |= {name: self._masked(values, mask) if name == "randomized" else values, f"_{name}": own}
+                continue
+            if values.dtype == object:
+                own &= np.array([value is not None for value in values])
+            elif mask is not None:
+                values = values.copy()
+                values[~mask] = 0
+            out |= {name: values, f"_{name}": own}
+        return out

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from plab.config import MethodConfig, ranges
+from plab.config.draws import without_draws
 from plab.config.families import GRADIENT, Appearance, Family
 from plab.runners.libraries import torch
 from plab.runners.policy import (
@@ -56,7 +57,8 @@ class ApgRunner(Runner):
         return torch_settings(self.method.torch_threads)
 
     def build(self) -> None:
-        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], self.method.contact))
+        cfg = without_draws(self.tracks[0].cfg)
+        (self._episode,) = shared_batches(self.cache, ([cfg], self.method.contact))
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:

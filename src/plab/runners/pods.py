@@ -94,7 +94,8 @@ class PodsTraining(Imitation):
         from plab.envs.tensors import TensorEnv
 
         env, observed, taken, total = TensorEnv(self.batch), [], [], 0.0
-        seen = env.reset()
+        # All episodes of a round are in what the round has drawn.
+        seen = env.reset(episode=self.episodes // (self.round_episodes[0] * self.batch.size))
         for t in range(self._horizon):
             with torch.no_grad():
                 chosen = self.network(self.scaled(seen)) if actions is None else actions[:, t]

@@ -152,7 +152,7 @@ class Population(Training):
         observations."""
         for stack in self.stacks:
             stack.watched = self.watched
-        observations = self._own(self._env.reset(), self._envs)
+        observations = self._own(self._env.reset(episode=self.episodes // self._envs), self._envs)
         if self.steps == 0:
             for stack, part in zip(self.stacks, self._split(observations), strict=True):
                 stack.begin(part)
@@ -167,11 +167,12 @@ class Population(Training):
         parts = zip(self.stacks, self._split(self._observations), strict=True)
         done = self._advance(torch.cat([stack.act(part) for stack, part in parts]))
         last = self._own(done.observation, self._envs)
-        observations = self._own(self._env.reset(), self._envs) if done.truncated else last
+        over = bool(done.truncated.all())
+        observations = self._own(self._env.reset(), self._envs) if over else last
         rewards = self._own(done.reward, self._envs).squeeze(2).float()
         gained = (self._split(part) for part in (rewards, last, observations))
         for stack, *part in zip(self.stacks, *gained, strict=True):
-            stack.learn(*part, over=done.truncated)
+            stack.learn(*part, over=over)
         self._observations = observations
 
     def _advance(self, actions: Tensor) -> Transition:
@@ -179,7 +180,7 @@ class Population(Training):
         done = self._env.step(actions.double().nan_to_num().flatten(0, 1), strict=False)
         self._reward += self._own(done.reward, self._envs).squeeze(2)
         self._actions.append(actions)
-        if done.truncated:
+        if done.truncated.all():
             for env, text in done.failures.items():
                 self._broken.setdefault(env // self._envs, []).append(text)
             score = self._own(done.info["score"], self._envs).squeeze(2)

@@ -96,7 +96,7 @@ class Sb3Training(Training):
         super().__init__(cfgs, batch, self._cycle_steps)
         self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
         envs = PlabVecEnv(batch)
-        envs.strict = False
+        envs.together = True
         self._env = VecMonitor(envs)
         arguments = self._kind.arguments(method, self._env)
         if isinstance(method, OffPolicyConfig):
@@ -140,7 +140,7 @@ class Sb3Training(Training):
         means = {n: float(np.mean(v)) if v else math.nan for n, v in zip(self.columns, values, strict=True)}
         logged = self.model.logger.name_to_value.items()
         losses = {n.removeprefix("train/"): float(v) for n, v in logged if n.startswith("train/")}
-        return [Learned(means, len(ended), [i["broken"] for i in ended if "broken" in i], losses)]
+        return [Learned(means, len(ended), [i["failure"] for i in ended if "failure" in i], losses)]
 
     def states(self) -> list[dict[str, Any]]:
         model, written = self.model, io.BytesIO()
@@ -162,13 +162,14 @@ class Sb3Training(Training):
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
         # The model, its random numbers, and the episodes that were under way.
+        written = io.BytesIO(state["model"].tobytes())
+        self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
+        self._set_logger()
+        self._env.unwrapped.next_episode = self.episodes // self._sizes.envs
         self._env.reset()
         for actions in state["episode_actions"]:
             self._env.step(actions)
             self.episode_actions.append(actions)
-        written = io.BytesIO(state["model"].tobytes())
-        self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
-        self._set_logger()
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])

@@ -99,7 +99,8 @@ class ShacTraining(ActorTraining):
 
         batch, method = self.batch, self._method
         parameters = list(self.network.parameters())
-        initial = torch.as_tensor(batch.reset()[1]["loss"], dtype=torch.float32, device=self._device)
+        _, info = batch.reset(episode=self.episodes // batch.size)
+        initial = torch.as_tensor(info["loss"], dtype=torch.float32, device=self._device)
         # Rewards in units of the loss at the start.
         scale = initial.mean().clamp(min=1e-12)
         left = rate_left if method.lr_decay else 1.0

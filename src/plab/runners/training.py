@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from plab.config import Config, ConfigError
+from plab.config.draws import without_draws
 from plab.config.selection import OBSERVED
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
@@ -249,7 +250,8 @@ class PolicyRunner(Runner):
 
         self.require_torch_device()
         cfgs = [track.cfg for track in self.tracks]
-        kinds = (self.training_configs(), self.method.contact), (cfgs, "hard")
+        judged = [without_draws(cfg) for cfg in cfgs]
+        kinds = (self.training_configs(), self.method.contact), (judged, "hard")
         batch, judge = shared_batches(self.cache, *kinds)
         self._judge, self.problem = TensorEnv(judge), judge.problem
         self.policies = self.training(cfgs, batch)

@@ -114,11 +114,16 @@ class ParticleOrder:
     def allocate(self, steps: int) -> ti.Ndarray:
         return ti.ndarray(ti.i32, shape=steps * self.places)
 
-    def reset(self) -> None:
-        """Return to the initial order."""
-        if self._changed:
+    def reset(self, environments: Sequence[int] | None = None) -> None:
+        """Return to the initial order, of all environments or of some."""
+        if self._changed and environments is None:
             copy_numbers(self.numbers, 0, self._start, self.places, 1)
             self._changed = False
+        if self._changed:
+            own = self.places // self._engine.batch
+            for e in environments or ():
+                first = int(e) * own
+                copy_numbers(self.numbers, first, self._start[first : first + own], own, 1)
 
     def current(self) -> np.ndarray:
         """The order at present, shape [batch, particle]."""

@@ -8,6 +8,7 @@ import gc
 import io
 import os
 import sys
+import threading
 import time
 import weakref
 from collections.abc import Mapping
@@ -72,6 +73,7 @@ class Runtime:
 _current: Runtime | None = None
 _users: weakref.WeakSet = weakref.WeakSet()
 _process: int | None = None
+_thread: int | None = None
 
 
 def available_threads() -> int:
@@ -98,10 +100,15 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     Raises:
         DeviceError: If CUDA was asked for and is not there.
         ValueError: If a name is unknown.
-        RuntimeError: If this process was forked from one that has started Taichi.
+        RuntimeError: If this process was forked from one that has started Taichi, or another thread has
+            started it.
     """
-    global _current
+    global _current, _thread
     _refuse_fork()
+    # Taichi makes fields in the thread that has initialised it, and aborts in others.
+    if _thread not in (None, threading.get_ident()):
+        raise RuntimeError("make all environments and simulators in one thread: Taichi is started in another")
+    _thread = threading.get_ident()
     if device not in DEVICES:
         raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
@@ -191,5 +198,10 @@ def register_user(user: object) -> None:
 
 
 def is_current(runtime: Runtime) -> bool:
-    """Return True if a runtime is still the active one."""
+    """Whether a runtime is still the one in force.
+
+    Raises:
+        RuntimeError: If this process was forked from the one that has started it.
+    """
+    _refuse_fork()
     return runtime is _current

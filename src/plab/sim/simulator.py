@@ -19,6 +19,7 @@ from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
 from plab.sim.runtime import is_current, register_user, start_runtime
+from plab.sim.starts import Starts, checked_positions
 from plab.sim.state import (
     Measures,
     Rollout,
@@ -124,6 +125,7 @@ class Simulator:
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
+        self._starts = Starts(self._engine)
         self._initial = self._particles.array(1)
         self._drive: Drive | None = None
         self._start_from(particles)
@@ -252,12 +254,51 @@ class Simulator:
         for term in self._engine.terms:
             term.set_target(held["mass"].astype(np.float64), held["sdf"])
 
+    def change_scenes(self, scenes: Sequence[Scene], particles: Mapping[int, np.ndarray]) -> None:
+        """Replace all scenes by others of the same kind between episodes; nothing is compiled anew.
+
+        Current states, targets, contact model and weights stay. Environments keep their initial particles,
+        unless they are given others.
+
+        Args:
+            scenes: One scene per environment.
+            particles: Initial positions of some environments, [particle, 3] each.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+            ValueError: If positions do not fit.
+        """
+        self._require_runtime()
+        require_alike(scenes, self.scenes[0])
+        held = {e: self._checked_particles(x) for e, x in particles.items()}
+        self.scenes = tuple(scenes)
+        self.changes += 1
+        self._version += 1
+        self._engine.fill_parameters(scenes)
+        self._start_manipulators()
+        for e, x in held.items():
+            order = self._particles.order.initial[e].astype(np.int32)
+            self._starts.place_at_rest(self._initial, e, order, x.reshape(-1))
+
     # -- forward ------------------------------------------------------------------------------------
 
-    def reset(self) -> None:
-        """Put all environments into their initial states."""
+    def reset(self, environments: Sequence[int] | None = None) -> None:
+        """Put all environments into their initial states, or some of them."""
         self._require_runtime()
         self._version += 1
+        if environments is not None:
+            chosen = np.zeros(self.batch, np.int32)
+            chosen[list(environments)] = 1
+            self._starts.copy_chosen(self._initial, self._particles.current, chosen)
+            self._particles.order.reset(environments)
+            poses = np.array(self.poses())
+            poses[chosen != 0] = self._initial_poses[chosen != 0]
+            if self._initial_joints is not None:
+                held = self._joints.cpu() if on_device(self._joints) else self._joints
+                self._joints = np.array(held)
+                self._joints[chosen != 0] = self._initial_joints[chosen != 0]
+            self._place(poses)
+            return
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
         self._particles.order.reset()
         self._joints: Any = self._initial_joints
@@ -386,11 +427,19 @@ class Simulator:
         shapes = [() if one is None else one.shape for one in (state.joints, self._initial_joints)]
         if shapes[0] != shapes[1]:
             raise ArgumentError(f"joints have shape {shapes[0]}, not {shapes[1]}")
+        self._checked_particles(state.x)
         self._version += 1
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()
         self._joints = None if state.joints is None else np.array(state.joints, np.float64)
         self._place(np.asarray(state.poses, np.float64))
+
+    def initial_state(self) -> State:
+        """The state from which :meth:`reset` and :meth:`rollout` start."""
+        self._require_runtime()
+        order = self._particles.order.initial
+        state = self._particles.unpack(self._initial.to_numpy(), self._initial_poses.copy(), order)
+        return replace(state, joints=self._initial_joints)
 
     def set_initial_state(self, state: State) -> None:
         """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
@@ -673,15 +722,24 @@ class Simulator:
         return self._particles.unpack(bar.to_numpy(), poses, order)
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
-        positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
+        if particles is not None and len(particles) != self.batch:
+            raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
+        given = map(sample_particles, self.scenes) if particles is None else particles
+        positions = [self._checked_particles(x) for x in given]
         self._particles.order.start_from(positions)
         self._engine.fill_bodies(self.scenes, self._particles.order.initial)
+        self._start_manipulators()
+        start = rest_state(np.stack(positions), self._initial_poses)
+        self._initial.from_numpy(self._particles.pack(start))
+
+    def _start_manipulators(self) -> None:
         self._initial_poses = initial_poses(self.scenes)
         chain = self.scenes[0].kinematics
         self._map = chain.action_map(self.scenes) if chain else None
         self._initial_joints: np.ndarray | None = self._map.start if self._map else None
-        start = rest_state(np.stack(positions), self._initial_poses)
-        self._initial.from_numpy(self._particles.pack(start))
+
+    def _checked_particles(self, x: ArrayLike) -> np.ndarray:
+        return checked_positions(x, self.particle_count, self.grid_size)
 
     def _place(self, poses: np.ndarray) -> None:
         """Place the manipulators for a start, at which nothing has gone wrong."""

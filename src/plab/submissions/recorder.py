@@ -116,11 +116,13 @@ def record(env: Env, folder: str | Path) -> Env:
         taken.append(np.array(actions, np.float64))
         for ledger in ledgers:
             ledger.steps += 1
-        if result.truncated:
-            # All episodes have as many steps as the last one.
-            episodes = np.stack(taken, axis=1)
-            for ledger, own, score in zip(ledgers, episodes, result.info["score"], strict=True):
-                ledger.add(own, float(score))
+        if "randomized" in result.info or not result.truncated.any():
+            return
+        # Of an episode that has reached the horizon the last steps are all.
+        episodes = np.stack(taken, axis=1)
+        for e in np.flatnonzero(result.truncated):
+            if e not in result.failures:
+                ledgers[e].add(episodes[e], float(result.info["score"][e]))
 
     batch.listener = observe
     return env

@@ -1,0 +1,244 @@
+"""Draws of episodes: scenes, starts, targets and noise that differ from reset to reset.
+
+Everything drawn is data of the simulator: nothing is compiled anew. What an episode draws depends on the
+environment's seed and the number of the episode alone, not on the batch or the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from plab.config import Config, ConfigError, build_scene, drawn_configs
+from plab.config.draws import (
+    NOISE,
+    SCENE,
+    SCENES,
+    Values,
+    checked,
+    draw,
+    extremes,
+    present_value,
+    ranges_of,
+    turned,
+    with_values,
+    yaws,
+)
+from plab.errors import ArgumentError
+from plab.problem import Problem, fits, make_targets, target_distance
+from plab.scenes import Scene, SceneError, sample_particles
+from plab.sim import Simulator
+from plab.targets import RECIPES, TargetError, build_target
+from plab.targets.recipes import TensorRecipe
+
+FIRST_SCENE = 1000
+"""``seed_scene`` of the first of the scenes that ``task.randomize.scenes`` draws from."""
+
+Target = tuple[np.ndarray, np.ndarray]
+"""Mass tensor of a target, and the distance to it."""
+
+
+@dataclass
+class _Base:
+    """A scene that values are put into: a sub-environment's own, or one of those that are drawn from."""
+
+    cfg: Config
+    scene: Scene
+    target: Target
+    particles: np.ndarray | None = None
+
+    def sample(self) -> np.ndarray:
+        """Return the particles' positions, shape [particle, 3]."""
+        if self.particles is None:
+            self.particles = sample_particles(self.scene)
+        return self.particles
+
+
+class Draws:
+    """Draws of the sub-environments of a batch.
+
+    Attributes:
+        values: What each sub-environment has in its episode, by dotted key; empty where it is as configured.
+        scenes: Scenes with all lowest and all highest values, which bound the observations.
+    """
+
+    def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
+        """Check that scenes can be simulated over the whole ranges, and make those that are drawn from.
+
+        Args:
+            cfgs: One configuration per sub-environment, :func:`~plab.config.draws.with_own_materials`.
+            problem: Their scenes and targets.
+
+        Raises:
+            plab.config.ConfigError: If a range does not do.
+        """
+        self._problem: Problem | None = problem
+        self._cfgs = list(cfgs)
+        self.values: list[Values] = [{} for _ in cfgs]
+        unique = {id(cfg): cfg for cfg in cfgs}
+        self._bounds = {key: ranges_of(cfg.task) for key, cfg in unique.items()}
+        self._pools = {
+            key: _pool(cfg, problem.simulator) for key, cfg in unique.items() if SCENES in cfg.task.randomize
+        }
+        targets = zip(problem.target_mass, problem.distances(), strict=True)
+        self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, targets, strict=True)]
+        self._placed = [(base, {}, _places(base.scene)) for base in self._bases]
+        self._targets: list[Any] = [None for _ in cfgs]
+        self.scenes = [base.scene for pool in self._pools.values() for base in pool]
+        for cfg in unique.values():
+            try:
+                ends = extremes(cfg) if cfg.task.randomize else []
+                self.scenes += [self._checked(one) for one in ends]
+            except (ConfigError, SceneError, TargetError) as error:
+                raise ConfigError(f"task.randomize: {error}") from None
+
+    @property
+    def changed(self) -> bool:
+        """Whether a sub-environment is not as it is configured."""
+        return any(self.values)
+
+    def release(self) -> None:
+        """Let go of the simulator and its memory."""
+        self._problem = None
+
+    def noise(self) -> np.ndarray:
+        """Return the standard deviations of the noise on observations, shape [batch]."""
+        return np.array([float(values.get(NOISE, 0.0)) for values in self.values])
+
+    def info(self) -> dict[str, np.ndarray]:
+        """Return what was drawn, by dotted key, each of shape [batch, ...]; NaN where a sub-environment is as
+        configured."""
+        known = {key: value for values in self.values for key, value in values.items()}
+        return {
+            key: np.array([values.get(key, np.full(np.shape(like), np.nan)) for values in self.values])
+            for key, like in sorted(known.items())
+        }
+
+    def redraw(
+        self, environments: Sequence[int], seeds: Sequence[Sequence[int]], given: Mapping[str, Any]
+    ) -> bool:
+        """Draw the next episodes of some sub-environments, and change the simulator's scenes and targets.
+
+        Args:
+            environments: Their numbers.
+            seeds: Entropy of each of them.
+            given: Values by dotted key that are not drawn, for all or one per sub-environment of the batch.
+
+        Returns:
+            Whether anything differs from the episodes before.
+
+        Raises:
+            ValueError: If there is no such key, or a scene cannot be simulated with a value.
+        """
+        drawn = {e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)}
+        return self.put(drawn)
+
+    def put(self, values: Mapping[int, Values]) -> bool:
+        """Give some sub-environments values; returns whether there are any."""
+        values = {e: own for e, own in values.items() if own != self.values[e]}
+        if not values:
+            return False
+        problem = cast(Problem, self._problem)
+        scenes, particles, targets = list(problem.scenes), {}, {}
+        for e, own in values.items():
+            base = self._base(e, own)
+            cfg = with_values(base.cfg, own)
+            try:
+                scenes[e] = self._checked(cfg)
+            except (ConfigError, SceneError, TargetError) as error:
+                raise ArgumentError(f"{', '.join(own)}: {error}") from None
+            place = base, yaws(cfg.task, own), _places(scenes[e])
+            if place != self._placed[e]:
+                particles[e] = _moved(*place)
+            follows = [key for key in own if key.startswith(("target.", "manipulators."))]
+            target = base, {key: own[key] for key in follows}
+            if target != (self._targets[e] or (self._bases[e], {})):
+                targets[e] = self._target(base, cfg, scenes[e]) if follows else base.target
+            self._placed[e], self._targets[e], self.values[e] = place, target, dict(own)
+        problem.vary(scenes, particles, targets)
+        return True
+
+    def _drawn(self, e: int, seed: Sequence[int], given: Mapping[str, Any]) -> Values:
+        cfg = self._cfgs[e]
+        pool = self._pools.get(id(cfg), ())
+        if not (cfg.task.randomize or given):
+            return {}
+        rng = np.random.default_rng(list(seed))
+        values = draw(self._bounds[id(cfg)], rng)
+        if pool:
+            values[SCENE] = int(rng.integers(len(pool)))
+        for key, value in given.items():
+            path = f"options['{key}']"
+            try:
+                each = np.shape(value) == (len(self._cfgs), *np.shape(present_value(cfg.task, key, path)))
+                values[key] = checked(cfg.task, key, value[e] if each else value, path)
+            except ConfigError as error:
+                raise ArgumentError(str(error)) from None
+        if SCENE in values and values[SCENE] not in range(len(pool)):
+            raise ArgumentError(
+                f"options['scene']: {values[SCENE]} is not below task.randomize.scenes={len(pool)}"
+            )
+        return values
+
+    def _base(self, e: int, values: Values) -> _Base:
+        if SCENE in values:
+            return self._pools[id(self._cfgs[e])][values[SCENE]]
+        return self._bases[e]
+
+    @staticmethod
+    def _checked(cfg: Config) -> Scene:
+        """Return the scene of a configuration whose values may be out of range."""
+        cfg.task.check("task")
+        return build_scene(cfg)
+
+    def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
+        """Return the target of a scene: the recipe's if that need not be simulated, else that of its base."""
+        kind = RECIPES[cfg.task.target["recipe"]]
+        if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
+            if cfg.task.target != base.cfg.task.target:
+                raise ArgumentError("this target is made once: draw among task.randomize.scenes")
+            return base.target
+        try:
+            mass = build_target(scene, cfg.task.target)
+            same = np.array_equal(mass, base.target[0])
+            return base.target if same else (mass, target_distance(mass))
+        except TargetError as error:
+            raise ArgumentError(str(error)) from None
+
+
+def _places(scene: Scene) -> list[Any]:
+    return [(body.center, body.size) for body in scene.bodies]
+
+
+def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np.ndarray:
+    """Return the particles of a scene whose bodies are where they are to be, shape [particle, 3]."""
+    x, bodies = base.sample().copy(), base.scene.particle_bodies
+    for number, (name, body) in enumerate(zip(base.cfg.task.bodies, base.scene.bodies, strict=True)):
+        own, center = bodies == number, np.array(places[number][0])
+        if places[number][0] != body.center:
+            x[own] += center - np.array(body.center)
+        if name in turns:
+            x[own] = turned(x[own], center, turns[name])
+    return x
+
+
+def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
+    """Make the scenes and targets that a configuration's episodes draw from."""
+    count = int(cfg.task.randomize[SCENES])
+    drawn = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
+    # Building them says what is wrong with all of them.
+    drawn = [one for one in drawn if fits(one)] or drawn
+    pool: list[_Base] = []
+    own, size = simulator.scenes, simulator.batch
+    for first in range(0, len(drawn), size):
+        some = drawn[first : first + size]
+        filled = [some[k % len(some)] for k in range(size)]
+        simulator.set_scenes([build_scene(one) for one in filled])
+        masses = make_targets(filled, simulator)
+        for one, scene, mass in zip(some, simulator.scenes, masses, strict=False):
+            pool.append(_Base(one, scene, (mass, target_distance(mass))))
+    simulator.set_scenes(own)
+    return pool

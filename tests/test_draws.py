@@ -1,0 +1,193 @@
+"""Draws at every reset: the same alone and in a batch, by seed, by option, in training."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+
+import plab
+from plab.config import ConfigError, load_config
+from plab.config.draws import ranges_of
+from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
+from plab.problem import Problem
+from plab.results import read
+from plab.runners import run_config
+
+DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
+COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=3", "sim.substeps=5"]
+COARSE += [f"sim.device={DEVICE}"]
+NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
+RANGES = {
+    "yield_stress": [20.0, 200.0],
+    "gravity": [[0.0, -33.0, 0.0], [0.0, -27.0, 0.0]],
+    "floor_friction": [0.1, 1.0],
+    "bodies": {"ball": {"offset": [[-0.02, 0.0, -0.02], [0.02, 0.02, 0.02]], "yaw": [-1.0, 1.0]}},
+    "manipulators": {"left": {"offset": [[0.0, 0.0, 0.0], [-0.02, 0.0, 0.0]][::-1], "friction": [0.1, 0.9]}},
+    "target": {"bodies": {"ball": {"center": [[0.6, 0.45, 0.7], [0.7, 0.5, 0.75]]}}},
+    "observation_noise": [0.0, 0.01],
+}
+
+pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
+
+
+@pytest.fixture(scope="module")
+def vector():
+    words = [*COARSE, NEAR, "observe_target=true"]
+    env = plab.make_vec("Move", num_envs=2, overrides=words, randomize=RANGES, autoreset_mode="Disabled")
+    yield env
+    env.close()
+
+
+def episode(env: gymnasium.Env, count: int, **how: object) -> list[object]:
+    """Results of a reset and of the steps of an episode."""
+    shape = (3, count, *env.unwrapped.batch.action_space.shape)
+    actions = np.random.default_rng(0).uniform(-1, 1, shape)
+    return [env.reset(**how), *(env.step(one) for one in (actions if count > 1 else actions[:, 0]))]
+
+
+def test_a_row_of_a_batch_is_an_environment_alone(vector) -> None:
+    bounds = ranges_of(vector.batch.configs[0].task)
+    first, again = episode(vector, 2, seed=5), episode(vector, 2)
+    alone = plab.make("Move", overrides=[*COARSE, NEAR, "observe_target=true"], randomize=RANGES)
+    tolerance = {} if DEVICE == "cpu" else {"rtol": 1e-3, "atol": 1e-4}
+    for known in (first, again):
+        how = {"seed": 6} if known is first else {}
+        observation, info = alone.reset(**how)
+        np.testing.assert_allclose(known[0][0][1], observation, **tolerance or {"rtol": 0})
+        assert known[0][1]["randomized"].keys() >= info["randomized"].keys()
+        for key, value in info["randomized"].items():
+            assert np.array_equal(known[0][1]["randomized"][key][1], value)
+            low, high = bounds[key]
+            assert np.all((low <= value) & (value <= high))
+        assert info["score"] == pytest.approx(0.0, abs=1e-6)
+        actions = np.random.default_rng(0).uniform(-1, 1, (3, 2, 6))
+        for t in range(3):
+            observation, reward, *_ = alone.step(actions[t, 1])
+            last = known[t + 1]
+            np.testing.assert_allclose(last[0][1], observation, **tolerance or {"rtol": 0})
+            assert last[1][1] == pytest.approx(reward, rel=0 if DEVICE == "cpu" else 1e-3)
+    assert not np.array_equal(first[0][0], again[0][0])
+    if DEVICE == "cpu":
+        # A state holds what was drawn.
+        alone.reset(seed=9)
+        copied = pickle.loads(pickle.dumps(alone.unwrapped))
+        assert data_equivalence(alone.step(actions[0, 0]), copied.step(actions[0, 0]), exact=True)
+        copied.close()
+    alone.close()
+
+
+def test_seeds_and_options(vector) -> None:
+    def drawn(**how: object) -> dict[str, np.ndarray]:
+        return vector.reset(**how)[1]["randomized"]
+
+    one, two, three = drawn(seed=1), drawn(), drawn(seed=1)
+    assert data_equivalence(one, three, exact=True)
+    assert not any(np.array_equal(one[key], two[key]) for key in one if key[0] != "_")
+    assert not np.array_equal(one["yield_stress"], drawn(seed=2)["yield_stress"])
+    given = drawn(seed=1, options={"yield_stress": 50.0, "bodies.ball.yaw": np.array([0.5, 0.0])})
+    assert given["yield_stress"].tolist() == [50, 50] and given["bodies.ball.yaw"].tolist() == [0.5, 0]
+    assert np.array_equal(given["gravity"], one["gravity"])
+    for options, named in (
+        ({"yield_strength": 1.0}, "yield_strength"),
+        ({"yield_stress": -1.0}, "yield_stress"),
+        ({"gravity": 3.0}, "gravity"),
+        ({"bodies.ball.offset": [0.9, 0.0, 0.0]}, "offset"),
+        ({"scene": 0}, "scene"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            vector.reset(options=options)
+
+
+def test_what_is_drawn_is_what_is_simulated(vector) -> None:
+    """A drawn episode is that of a task that has the numbers itself, to the last bit on the CPU."""
+    options = {"yield_stress": 30.0, "gravity": [0.0, -28.0, 0.0], "observation_noise": 0.0}
+    options |= {"bodies.ball.offset": [0.01, 0.0, 0.0], "bodies.ball.yaw": 0.0, "floor_friction": 0.5}
+    options |= {"manipulators.left.offset": [-0.01, 0.0, 0.0], "manipulators.left.friction": 0.3}
+    options["target.bodies.ball.center"] = [0.65, 0.47, 0.72]
+    drawn = episode(vector, 2, options=options)
+    cfg = load_config(["task=Move", *COARSE, NEAR, "observe_target=true"])
+    task = replace(cfg.task, yield_stress=30.0, gravity=[0.0, -28.0, 0.0], floor_friction=0.5)
+    ball, left = task.bodies["ball"], task.manipulators["left"]
+    task.bodies["ball"] = replace(ball, center=[ball.center[0] + 0.01, *ball.center[1:]])
+    position = [left.position[0] - 0.01, *left.position[1:]]
+    task.manipulators["left"] = replace(left, position=position, friction=0.3)
+    task.target["bodies"]["ball"]["center"] = [0.65, 0.47, 0.72]
+    batch = EpisodeBatch([replace(cfg, task=task)] * 2)
+    observation, info = batch.reset()
+    tolerance = {"rtol": 1e-5, "atol": 1e-6}
+    np.testing.assert_allclose(drawn[0][0], observation, **tolerance)
+    np.testing.assert_allclose(drawn[0][1]["loss"], info["loss"], rtol=1e-5)
+    np.testing.assert_allclose(batch.problem.initial_mass, vector.batch.problem.initial_mass, atol=1e-6)
+    for t, action in enumerate(np.random.default_rng(0).uniform(-1, 1, (3, 2, 6))):
+        done = batch.step(action)
+        np.testing.assert_allclose(drawn[t + 1][1], done.reward, rtol=1e-4, atol=1e-7)
+    batch.close()
+
+
+def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() -> None:
+    cfg = load_config(["task=Rope", *COARSE])
+    batch = EpisodeBatch([cfg] * 2, randomize={"scenes": 3})
+    env, seen = TensorEnv(batch), set()
+    for _ in range(4):
+        env.reset()
+        numbers = batch.draws.info()["scene"]
+        seen |= set(numbers.tolist())
+        for e, scene in enumerate(batch.problem.scenes):
+            drawn = load_config(
+                ["task=Rope", "variant=random", f"seed_scene={1000 + int(numbers[e])}", *COARSE]
+            )
+            assert scene.manipulators[2].position == tuple(drawn.task.manipulators["pillar"].position)
+            np.testing.assert_allclose(batch.problem.target_mass[e], Problem([drawn]).target_mass[0])
+    assert len(seen) > 1
+    batch.close()
+    ranges = {"bodies": {"box_1": {"yield_stress": [10.0, 20.0]}}}
+    three = EpisodeBatch([load_config(["task=TripleMove", *COARSE])], randomize=ranges)
+    three.reset()
+    stresses = [material.yield_stress for material in three.problem.scenes[0].materials]
+    assert 10 <= stresses[0] <= 20 and stresses[1] == stresses[2] == three.configs[0].task.yield_stress
+    three.close()
+
+
+def test_refusals() -> None:
+    for words, named in (
+        ("yield=[1,2]", "task.yield does not"),
+        ("yield_stress=[2,1]", "above"),
+        ("yield_stress=3", "low, high"),
+        ("gravity=[1,2]", "3 numbers"),
+        ("bodies.ball.center=[[0,0,0],[1,1,1]]", "offset"),
+        ("observation_noise=[-1,0]", "observation_noise"),
+        ("scenes=0", "scenes"),
+    ):
+        with pytest.raises(ConfigError, match=named) as info:
+            load_config(["task=Move", f"+task.randomize.{words}"])
+        assert "task.randomize" in str(info.value) and "\n" not in str(info.value)
+    with pytest.raises(ConfigError, match="stability"):
+        EpisodeBatch([load_config(["task=Move", *COARSE])], randomize={"youngs_modulus": [1e3, 1e9]})
+    assert load_config(["task=Move"]).hash == load_config(["task=Move", "+task.randomize={}"]).hash
+
+
+@pytest.mark.parametrize("method", ["ppo", "pods"])
+def test_methods_train_in_drawn_episodes(method: str, tmp_path: Path) -> None:
+    """Another range leads to other training and to an evaluation in the same scene."""
+    words = [f"method={method}", "task=Move", *COARSE, f"results_dir={tmp_path}", "progress=false"]
+    words += ["method.episodes=4", "method.num_envs=2", "method.evaluate_every=2", "method.hidden=[8]"]
+    if DEVICE == "cuda":
+        words.append("method.torch_device=cuda")
+    cfgs = [load_config([*words, *key]) for key in ([], HEAVY)]
+    for cfg in cfgs:
+        run_config(cfg)
+    rows = [read(cfg.path).columns for cfg in cfgs]
+    # The evaluation is in the scene as configured.
+    assert rows[0]["loss"][0] == pytest.approx(rows[1]["loss"][0], rel=1e-4)
+    assert not np.array_equal(rows[0]["train_reward"], rows[1]["train_reward"], equal_nan=True)
+
+
+HEAVY = ["+task.randomize.yield_stress=[1,5]", "+task.randomize.gravity=[[0,-90,0],[0,-60,0]]"]

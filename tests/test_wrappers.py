@@ -1,0 +1,185 @@
+"""Gymnasium's conventions: autoreset, wrappers, ends of episodes, in vector environments and alone."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import gymnasium.wrappers as single
+import gymnasium.wrappers.vector as many
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import plab
+from plab.envs.sb3 import PlabVecEnv
+from suite import make_not_finite
+
+HORIZON = 3
+COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", f"sim.horizon={HORIZON}", "sim.substeps=5"]
+COARSE += ["task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"]
+PICTURES = {
+    "observe": ["state", "depth"],
+    "cameras": {"front": {"position": (0.5, 0.9, 1.7), "target": (0.5, 0.2, 0.5)}},
+}
+WIDE, ACTIONS = Box(-1, 1, (6,), np.float64), Box(-2, 2, (2, 6), np.float64)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    envs = [plab.make("Move", overrides=COARSE) for _ in range(2)]
+    yield envs
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture(scope="module", params=list(AutoresetMode), ids=lambda mode: mode.value)
+def vector(request):
+    env = plab.make_vec("Move", num_envs=2, overrides=COARSE, autoreset_mode=request.param.value)
+    yield env
+    env.close()
+
+
+def test_every_autoreset_mode_is_that_of_gymnasium(vector, alone) -> None:
+    mode = vector.metadata["autoreset_mode"]
+    reference = SyncVectorEnv([lambda env=env: env for env in alone], autoreset_mode=mode)
+    assert data_equivalence(vector.reset(seed=0), reference.reset(seed=0), exact=True)
+    rng = np.random.default_rng(0)
+    over = np.zeros(2, bool)
+    for t in range(3 * HORIZON):
+        if t == 1 or (mode == AutoresetMode.DISABLED and over.any()):
+            # From then on the episodes end one after the other.
+            mask = np.array([True, False]) if t == 1 else over
+            got, want = (one.reset(options={"reset_mask": mask}) for one in (vector, reference))
+            assert np.array_equal(got[0], want[0])
+            assert all(np.array_equal(got[1][name][mask], want[1][name][mask]) for name in want[1])
+        actions = rng.uniform(-1, 1, (2, 6))
+        got, want = vector.step(actions), reference.step(actions)
+        assert data_equivalence(got, want, exact=True)
+        over = got[2] | got[3]
+    if mode == AutoresetMode.DISABLED:
+        with pytest.raises(ResetNeeded):
+            for _ in range(HORIZON):
+                vector.step(actions)
+
+
+def test_a_diverged_environment_is_truncated_and_the_others_go_on(vector, alone) -> None:
+    mode, actions = vector.metadata["autoreset_mode"], np.full((2, 6), 0.5)
+    vector.reset()
+    make_not_finite(vector.batch.problem.simulator, 0)
+    observation, _, terminated, truncated, info = vector.step(actions)
+    assert truncated.tolist() == [True, False] and not terminated.any() and np.isfinite(observation).all()
+    reasons = info["final_info"]["failure"] if mode == AutoresetMode.SAME_STEP else info["failure"]
+    assert "not finite" in reasons[0] and reasons[1] is None
+    if mode == AutoresetMode.DISABLED:
+        with pytest.raises(ResetNeeded):
+            vector.step(actions)
+        return
+    ends = [vector.step(actions)[3].tolist() for _ in range(HORIZON)]
+    assert [end[1] for end in ends][:2] == [False, True] and not ends[0][0]
+    env = PlabVecEnv(vector.batch)
+    env.reset()
+    make_not_finite(vector.batch.problem.simulator, 1)
+    _, _, over, infos = env.step(actions)
+    assert over.tolist() == [False, True] and infos[1]["TimeLimit.truncated"]
+    assert "not finite" in infos[1]["failure"] and "terminal_observation" in infos[1]
+    assert not env.step(actions)[2].any()
+
+
+def test_success_ends_an_episode_if_asked_to(alone) -> None:
+    env = plab.make_vec("Move", num_envs=2, overrides=COARSE, success_score=0.0, terminate_on_success=True)
+    env.reset()
+    _, _, terminated, truncated, info = env.step(np.zeros((2, 6)))
+    assert terminated.all() and not truncated.any() and info["final_info"]["success"].all()
+    env.close()
+    assert alone[0].reset()[1]["success"] is False
+    assert alone[0].spec.max_episode_steps == HORIZON
+
+
+def test_wrappers_of_environments(alone) -> None:
+    env, picture = alone[0], plab.make("Move", overrides=COARSE, **PICTURES)
+    size = env.observation_space.shape[0]
+    wrapped = [
+        single.DelayObservation(env, 1),
+        single.DtypeObservation(env, np.float64),
+        single.FrameStackObservation(env, 2),
+        single.NormalizeObservation(env),
+        single.RescaleObservation(env, np.float32(-1), np.float32(1)),
+        single.ReshapeObservation(env, (2, size // 2)),
+        single.TimeAwareObservation(env),
+        single.TransformObservation(env, np.copy, env.observation_space),
+        single.MaxAndSkipObservation(env, 2),
+        single.FlattenObservation(picture),
+        single.FilterObservation(picture, ["front_depth"]),
+        single.ClipAction(env),
+        single.RescaleAction(env, -2.0, 2.0),
+        single.StickyAction(env, 0.5),
+        single.TransformAction(env, np.copy, WIDE),
+        single.ClipReward(env, -1.0, 1.0),
+        single.NormalizeReward(env),
+        single.TransformReward(env, abs),
+        single.RecordEpisodeStatistics(env),
+        single.TimeLimit(env, HORIZON),
+        single.Autoreset(env),
+    ]
+    for one in wrapped:
+        observation, _ = one.reset(seed=0)
+        assert one.observation_space.contains(observation), one
+        while not (result := one.step(one.action_space.sample()))[3]:
+            assert one.observation_space.contains(result[0]), one
+    picture.close()
+
+
+def test_wrappers_of_vector_environments(vector) -> None:
+    env, mode = vector, vector.metadata["autoreset_mode"]
+    wrapped = [
+        many.ClipAction(env),
+        many.RescaleAction(env, -2.0, 2.0),
+        many.TransformAction(env, np.copy, ACTIONS),
+        many.VectorizeTransformAction(env, single.RescaleAction, min_action=-2.0, max_action=2.0),
+        many.ClipReward(env, -1.0, 1.0),
+        many.NormalizeReward(env),
+        many.TransformReward(env, abs),
+        many.RecordEpisodeStatistics(env),
+        many.DictInfoToList(env),
+    ]
+    # Gymnasium refuses the others in the other modes.
+    if mode != AutoresetMode.SAME_STEP:
+        wrapped += [
+            many.DtypeObservation(env, np.float64),
+            many.FlattenObservation(env),
+            many.RescaleObservation(env, np.float32(-1), np.float32(1)),
+            many.TransformObservation(env, np.copy, env.observation_space),
+        ]
+    if mode == AutoresetMode.NEXT_STEP:
+        wrapped.append(many.NormalizeObservation(env))
+    for one in wrapped:
+        observation, _ = one.reset(seed=0)
+        for _ in range(HORIZON + (mode != AutoresetMode.DISABLED)):
+            assert one.observation_space.contains(observation), one
+            observation, *_ = one.step(one.action_space.sample())
+
+
+def test_threads_and_forks(alone) -> None:
+    rewards: list[float] = []
+
+    def go(env) -> None:
+        env.reset()
+        rewards.append(env.step(np.ones(6))[1])
+
+    threads = [threading.Thread(target=go, args=(env,)) for env in alone]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(rewards) == 2 and rewards[0] == rewards[1]
+    if (child := os.fork()) == 0:
+        try:
+            alone[0].step(np.ones(6))
+        except RuntimeError as error:
+            os._exit(7 if "forked" in str(error) else 1)
+        os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
