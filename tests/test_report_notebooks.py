@@ -154,14 +154,14 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
     bench.mkdir(), nothing.mkdir()
     for benchmark, rows in ((ACCURACY, accuracy_rows()), (PRECISION, precision_rows()), (SPEED, speed)):
         rows.to_csv(bench / benchmark.file, index=False)
-    command = "python -m plab.report notebooks"
+    command = "plab report notebooks"
     text = run_cells(name, monkeypatch, RESULTS=[str(results)], BENCH=str(bench), COMMAND=command)
     assert command in text and re.search("[0-9a-f]{64}", text)
     assert all(part in text for part in EXPECTED[name])
     text = run_cells(name, monkeypatch, RESULTS=[str(nothing)], BENCH=str(nothing))
     assert text.count("There are no finished runs in") == 1
     for benchmark in {"speed": (SPEED,), "accuracy": (ACCURACY, PRECISION)}.get(name, ()):
-        assert f"There is no {nothing / benchmark.file}: `python " in text
+        assert f"There is no {nothing / benchmark.file}: `" in text
 
 
 def test_a_folder_without_runs_is_named(tmp_path: Path, told) -> None:
@@ -178,6 +178,6 @@ def test_notebooks_become_pages(tmp_path: Path) -> None:
     assert main(["notebooks", "example", "--out", str(out)]) == 0
     for name in NOTEBOOKS:
         page = (out / f"{name}.html").read_text()
-        assert "data:image/png;base64" in page and "python -m plab.report notebooks" in page
+        assert "data:image/png;base64" in page and "plab report notebooks" in page
         assert not re.search(r"""(?:src|href)=["'](?:https?:)?//""", page)
         assert "There is no " not in page

@@ -79,7 +79,7 @@ def test_page_has_runs_and_what_is_missing(results: Path, page: Path) -> None:
     assert [one.name for one in best] == ["Rope-v1", "Rope-v2"]
     assert [best[0].runs[name]["seed"] for name in ("adam", "gd")] == ["1", "0"]
 
-    assert "python -m plab.report html" in text
+    assert "plab report html" in text
     assert collect(results, select(["task=Move,Rope"], NAMES)).digest in text
     assert all(name in text for name in load(results)["config_hash"])
     assert "6 runs by Adam and GD on 2 configurations of Rope" in text
@@ -97,7 +97,7 @@ def test_details_have_curves_runs_and_commands(page: Path) -> None:
     x, mean, std = details["adam"]["curves"]["reward"]["episodes"]
     assert x[0] == 1 and x[-1] == 6 and len(mean) == len(std) == len(x)
     command = details["adam"]["runs"][1]["command"]
-    assert command.startswith("python -m plab.run task=Rope variant=1 method=adam seed=1")
+    assert command.startswith("plab run task=Rope variant=1 method=adam seed=1")
     assert "sim.particles_scale=0.03" in command and "sim.horizon=3" in command
 
 

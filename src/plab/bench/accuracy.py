@@ -1,9 +1,9 @@
 """Work-precision diagrams: what a run costs against how far it is from a fine reference.
 
-    python -m plab.bench.accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
-    python -m plab.bench.accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
-    python -m plab.bench.accuracy --task Move,Rope --particles 3000
-    python -m plab.bench.accuracy --device cuda --output accuracy_cuda
+    plab bench accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
+    plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
+    plab bench accuracy --task Move,Rope --particles 3000
+    plab bench accuracy --device cuda --output accuracy_cuda
 
 Settings differ in the number of substeps, from below the stability limit upwards, in precision, in how the
 material is computed (series or singular values), in contact model, and in the grid, with as many particles
@@ -19,7 +19,6 @@ of the mass tensor.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -295,20 +294,6 @@ def main(argv: Sequence[str]) -> None:
     from plab.report.accuracy import diagrams
     from plab.report.figures import save, style
 
-    options = _options(argv)
-    plan = QUICK if options.quick else Plan()
-    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
-    tasks, output = options.task or (QUICK_TASKS if options.quick else TASKS), options.output
-    output.mkdir(parents=True, exist_ok=True)
-    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
-    with style():
-        drawings = diagrams(pd.DataFrame(table))
-    save(drawings, output, {"footer": ["python -m plab.bench.accuracy"]})
-    for drawing in drawings:
-        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
-
-
-def _options(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser("plab bench accuracy", __doc__)
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
     text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"
@@ -320,7 +305,16 @@ def _options(argv: Sequence[str]) -> argparse.Namespace:
     options = parser.parse_intermixed_args(argv)
     if unknown := set(options.task or ()) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
-    return options
+    plan = QUICK if options.quick else Plan()
+    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
+    tasks, output = options.task or (QUICK_TASKS if options.quick else TASKS), options.output
+    output.mkdir(parents=True, exist_ok=True)
+    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
+    with style():
+        drawings = diagrams(pd.DataFrame(table))
+    save(drawings, output, {"footer": ["plab bench accuracy"]})
+    for drawing in drawings:
+        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
 
 
 if __name__ == "__main__":

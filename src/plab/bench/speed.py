@@ -1,17 +1,16 @@
 """Time of an environment step.
 
-    python -m plab.bench.speed                                       Move on the CPU
-    python -m plab.bench.speed --quick                               the same in less than a minute
-    python -m plab.bench.speed task=Rope sim.device=cuda --batch 1 64
-    python -m plab.bench.speed --task Move,Torus --precision float32 float64
-    python -m plab.bench.speed --paper                               the paper's table of ten tasks
+    plab bench speed                                       Move on the CPU
+    plab bench speed --quick                               the same in less than a minute
+    plab bench speed task=Rope sim.device=cuda --batch 1 64
+    plab bench speed --task Move,Torus --precision float32 float64
+    plab bench speed --paper                               the paper's table of ten tasks
 
 Rows are printed as they come, and written to --csv. docs/benchmarks.md explains the columns.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import itertools
 import sys
@@ -49,7 +48,7 @@ QUICK_KINDS = (FORWARD, GRADIENT)
 HEADING = """\
 # Time per environment step
 
-Milliseconds per environment step and environment, measured with `python -m plab.bench.speed --paper`, beside
+Milliseconds per environment step and environment, measured with `plab bench speed --paper`, beside
 what the PlasticineLab paper gives for a GTX 1080 Ti, and the paper's divided by ours. The forward pass
 includes loss and reward.
 
@@ -130,7 +129,21 @@ def paper_row(overrides: Sequence[str], batch: int, steps: int, repeats: int) ->
 @command_line
 def main(argv: Sequence[str]) -> int:
     """Time environment steps, print, write the files asked for; return 1 if a row needs too much memory."""
-    options = _options(argv)
+    parser = Parser("plab bench speed", __doc__)
+    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
+    parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
+    parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
+    parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
+    parser.add_argument("--steps", type=positive, help="environment steps per rollout")
+    parser.add_argument("--repeats", type=positive, help="timed rollouts")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="kinds of calls to time")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
+    parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
+    parser.add_argument("--paper", action="store_true", help="the paper's table beside ours")
+    options = parser.parse_intermixed_args(argv)
+    if not options.task and not any(word.startswith("task=") for word in options.overrides):
+        options.task = list(suite_tasks()) if options.paper else ["Move"]
     quick, batches = options.quick, options.batch
     steps, repeats = options.steps or (5 if quick else 10), options.repeats or (3 if quick else 7)
     # Taichi starts anew for each precision, so precisions change last.
@@ -152,25 +165,6 @@ def main(argv: Sequence[str]) -> int:
     parts = (rows(load_config(own), batch, steps, repeats, kinds) for own, batch in cells)
     table = measure_table(COLUMNS, itertools.chain.from_iterable(parts), options.csv, widths)
     return 0 if len(table) == len(cells) * len(kinds) else 1
-
-
-def _options(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("plab bench speed", __doc__)
-    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
-    parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
-    parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
-    parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
-    parser.add_argument("--steps", type=positive, help="environment steps per rollout")
-    parser.add_argument("--repeats", type=positive, help="timed rollouts")
-    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="kinds of calls to time")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
-    parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
-    parser.add_argument("--paper", action="store_true", help="the paper's table beside ours")
-    options = parser.parse_intermixed_args(argv)
-    if not options.task and not any(word.startswith("task=") for word in options.overrides):
-        options.task = list(suite_tasks()) if options.paper else ["Move"]
-    return options
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Stability of the simulator under violent actions.
 
-    python -m plab.bench.stability                      # everything, in both precisions
-    python -m plab.bench.stability --quick              # a few minutes on two cores
-    python -m plab.bench.stability --precision float32 --particles 1000 --csv cases.csv
-    python -m plab.bench.stability --quick --family "1000 steps"
+    plab bench stability                      # everything, in both precisions
+    plab bench stability --quick              # a few minutes on two cores
+    plab bench stability --precision float32 --particles 1000 --csv cases.csv
+    plab bench stability --quick --family "1000 steps"
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
 steps, and of first variants over 1000. Every case is simulated forwards and backwards. It has survived if
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -123,11 +124,7 @@ def stress_cases(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
-    """Run cases and judge them.
-
-    Args:
-        cases: The cases.
-        precision: ``float32`` or ``float64``.
+    """Run cases in a precision, ``float32`` or ``float64``, and judge them.
 
     Yields:
         A row of :data:`COLUMNS` per case: outcome (``survived`` or the failure), fastest particle [cells per
@@ -147,12 +144,11 @@ def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str,
 
 def _groups(cases: Sequence[StressCase]) -> list[list[StressCase]]:
     """Group the cases that can share a compiled simulator and a rollout."""
-    groups: dict[tuple, list[StressCase]] = {}
+    groups: dict[tuple, list[StressCase]] = defaultdict(list)
     for case in cases:
-        scene = case.scene
-        shapes = tuple(m.shape for m in scene.manipulators)
+        scene, shapes = case.scene, tuple(m.shape for m in case.scene.manipulators)
         kind = (shapes, scene.particle_count, scene.grid_size, scene.dt, scene.substeps)
-        groups.setdefault((*kind, len(case.actions), case.contact_weight), []).append(case)
+        groups[(*kind, len(case.actions), case.contact_weight)].append(case)
     return list(groups.values())
 
 
@@ -215,9 +211,9 @@ def _outcome(precision: str, case: StressCase, e: int, state: State, mass: np.nd
 
 def summarise(rows: Sequence[Mapping[str, object]]) -> int:
     """Print how many cases of each family survived; return the exit code."""
-    survived: dict[tuple, list[bool]] = {}
+    survived: dict[tuple, list[bool]] = defaultdict(list)
     for row in rows:
-        survived.setdefault((row["precision"], row["family"]), []).append(row["outcome"] == "survived")
+        survived[row["precision"], row["family"]].append(row["outcome"] == "survived")
     every = [one for own in survived.values() for one in own]
     counts = [(*which, len(own), sum(own)) for which, own in survived.items()]
     print()

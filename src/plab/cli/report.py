@@ -22,7 +22,7 @@ from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
 from plab.report.media import lacking, remove_earlier
-from plab.report.notebooks import NOTEBOOKS, execute, require_packages
+from plab.report.notebooks import NOTEBOOKS, execute, require_notebooks
 from plab.report.page import Page
 from plab.report.reference import ACCURACY, SPEED, measured
 from plab.report.writing import origin, write_curves, write_tables
@@ -75,7 +75,7 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
     _require_runs(runs, options.sources)
     given = {"RESULTS": [str(source) for source in options.sources], "WORDS": options.words}
     given |= {"BENCH": str(options.bench), "COMMAND": command}
-    require_packages()
+    require_notebooks()
     with show_progress("notebooks", 0, len(NOTEBOOKS), plain_every=1) as report:
         return f"{len(execute(NOTEBOOKS, given, out, report))} notebooks"
 

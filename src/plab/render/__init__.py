@@ -1,4 +1,4 @@
-"""Pictures of scenes and rollouts: :class:`Renderer`, and ``python -m plab.render`` on the command line.
+"""Pictures of scenes and rollouts: :class:`Renderer`, and ``plab render`` on the command line.
 
 PyVista, which draws, is optional: ``pip install 'plab[render]'``. docs/rendering.md has the details.
 """

@@ -37,7 +37,7 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
     runs = collect([resolve(source) for source in results], select(words, NAMES))
     if runs.table.empty:
         say(
-            f"There are no finished runs in {', '.join(map(str, results))}: `python -m plab.run task=Move` "
+            f"There are no finished runs in {', '.join(map(str, results))}: `plab run task=Move` "
             "makes one, and `results=example` shows those that come with plab."
         )
     return runs

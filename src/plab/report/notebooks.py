@@ -31,13 +31,11 @@ def notebook_folder() -> Path:
     raise ResultsError(f"no reports/ next to {package}: the installation is incomplete, install plab again")
 
 
-def require_packages() -> None:
+def require_notebooks() -> None:
     """Raise :class:`plab.results.ResultsError` if a package that executes notebooks is missing."""
-    missing = [name for name in _PACKAGES if find_spec(name) is None]
-    if missing:
-        raise ResultsError(
-            f"notebooks need {', '.join(missing)}, not installed here: pip install 'plab[report]'"
-        )
+    if missing := [name for name in _PACKAGES if find_spec(name) is None]:
+        what = f"{', '.join(missing)}, not installed here: pip install 'plab[report]'"
+        raise ResultsError(f"notebooks need {what}")
 
 
 def execute(
@@ -57,7 +55,7 @@ def execute(
     Raises:
         plab.results.ResultsError: If a notebook breaks off.
     """
-    require_packages()
+    require_notebooks()
     import nbformat
 
     out.mkdir(parents=True, exist_ok=True)

@@ -287,7 +287,7 @@ def _command(config: Mapping[str, Any]) -> str:
     if config["sim"]["device"] != "cpu":
         words.append(f"sim.device={config['sim']['device']}")
     words += [f"{key}={_word(value)}" for key, value in changed_settings(config).items()]
-    return shlex.join(["python", "-m", "plab.run", *words])
+    return shlex.join(["plab", "run", *words])
 
 
 def _word(value: Any) -> str:

@@ -52,12 +52,12 @@ class Benchmark:
 
 SPEED = Benchmark(
     "speed.csv",
-    "python -m plab.bench.speed --paper --csv {file}",
+    "plab bench speed --paper --csv {file}",
     ("task", "device", "batch", "forward_ms", "gradient_ms"),
 )
 ACCURACY = Benchmark(
     "accuracy.csv",
-    "python -m plab.bench.accuracy --output {folder}",
+    "plab bench accuracy --output {folder}",
     (
         *("axis", "task", "contact", "precision", "material", "substeps", "ms_per_step"),
         *("positions", "gradient", "outcome"),

@@ -1,7 +1,7 @@
 """Target recipes: the shapes that the plasticine is to take, as mass tensors.
 
 A recipe is a dataclass; :data:`RECIPES` lists them by the name that a task's YAML gives as ``target.recipe``.
-The remaining keys of ``target`` are the dataclass's fields. ``python -m plab.targets`` builds the targets of
+The remaining keys of ``target`` are the dataclass's fields. ``plab targets`` builds the targets of
 the suite.
 """
 

@@ -24,7 +24,7 @@ class Viewer:
     """A rollout in 3-D; a notebook whose cell ends with it shows the viewer.
 
     Attributes:
-        page: The page, HTML; written to a file it is what ``python -m plab.view`` writes.
+        page: The page, HTML; written to a file it is what ``plab view`` writes.
         score: Score of the last state, NaN without a target.
         height: Height of the viewer in a notebook [pixels].
     """

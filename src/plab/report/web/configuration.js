@@ -28,7 +28,7 @@ function showConfiguration(one) {
   const place = make("article", { "data-name": one.name }, make("h1", {}, `${one.task}, variant ${one.variant}`));
   if (!runsOf(one)) {
     place.append(make("p", { class: "missing" }, "There are no finished runs of this configuration: ",
-      make("code", {}, `python -m plab.run task=${one.task} variant=${one.variant}`), " makes one."));
+      make("code", {}, `plab run task=${one.task} variant=${one.variant}`), " makes one."));
     return place;
   }
   place.append(pictures(one));
@@ -42,7 +42,7 @@ function showConfiguration(one) {
 function pictures(one) {
   const made = ["start", "target"].filter((what) => one.pictures[what]);
   if (!made.length) {
-    return make("p", { class: "missing" }, "No pictures yet: ", make("code", {}, "python -m plab.report html"), " draws them where there is OpenGL, with ", make("code", {}, "pip install 'plab[render]'"), ".");
+    return make("p", { class: "missing" }, "No pictures yet: ", make("code", {}, "plab report html"), " draws them where there is OpenGL, with ", make("code", {}, "pip install 'plab[render]'"), ".");
   }
   return make("div", { class: "pictures" }, ...made.map((what) => make("figure", {},
     make("img", { src: one.pictures[what], alt: `${one.name}: ${what}`, width: 480, height: 360 }),
@@ -81,7 +81,7 @@ function runTable(one, details) {
   const heads = ["method", "seed", "score", "soft IoU", "best loss", "best row", "time", "computed on", "SHA-256", ""];
   const head = make("tr", {}, ...heads.map((text, at) => make("th", { class: at > 0 && at < 7 ? "number" : "" }, text)));
   const chosen = details[one.best], best = chosen.runs.find((run) => run.hash === chosen.best);
-  const commands = [best.command, `python -m plab.render ${best.path} --output rollout.mp4`].map((text) => make("code", {}, text));
+  const commands = [best.command, `plab render ${best.path} --output rollout.mp4`].map((text) => make("code", {}, text));
   return [make("h2", {}, "Runs"), make("div", { class: "scroll" }, make("table", { class: "plain runs" }, make("thead", {}, head), make("tbody", {}, ...body))),
     make("p", { class: "note" }, "Times of runs that were computed at once are each one's share. The run with the highest score is made again, and drawn, by"), make("div", { class: "commands" }, ...commands)];
 }
