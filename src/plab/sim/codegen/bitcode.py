@@ -116,7 +116,10 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
     except ImportError as error:
         raise _unsupported(f"plab compiles its laws with llvmlite, which does not load: {error}") from None
     from plab.sim.codegen import materials, stencils
+    from plab.sim.compiler import QUADRANTS
 
+    if llvm.llvm_version_info[0] > 16 and not QUADRANTS:
+        raise _unsupported(f"llvmlite {version('llvmlite')} is newer than Taichi: pip install 'llvmlite<0.45'")
     if unit == "atomics":
         text = Path(__file__).with_name("cuda_global.ll").read_text(encoding="utf-8")
         if llvm.llvm_version_info[0] > 16:
