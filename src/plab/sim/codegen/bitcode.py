@@ -119,7 +119,9 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
     from plab.sim.compiler import QUADRANTS
 
     if llvm.llvm_version_info[0] > 16 and not QUADRANTS:
-        raise _unsupported(f"llvmlite {version('llvmlite')} is newer than Taichi: pip install 'llvmlite<0.45'")
+        raise _unsupported(
+            f"llvmlite {version('llvmlite')} is newer than Taichi: pip install 'llvmlite<0.45'"
+        )
     if unit == "atomics":
         text = Path(__file__).with_name("cuda_global.ll").read_text(encoding="utf-8")
         if llvm.llvm_version_info[0] > 16:
