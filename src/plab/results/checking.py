@@ -93,7 +93,8 @@ def _iterations(run: RunResult) -> Iterator[str]:
     wanted = common if family is None else (*common, *family.columns)
     # Further columns of a family outside plab may hold anything.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
-    if missing := [name for name in wanted if name not in table]:
+    # Files of an earlier version may lack what may be unknown.
+    if missing := [name for name in wanted if name not in table and name not in may_be_nan]:
         yield f"iterations lack {', '.join(missing)}"
         return
     if endless := [name for name in table if name not in may_be_nan and not np.isfinite(table[name]).all()]:

@@ -216,6 +216,8 @@ class RunFile:
         """Write the progress for ``plab status``: rows, episodes, and the score of the best row."""
         known = self.result
         score = known.columns.get("score", np.full(known.rows, math.nan))[known.best_iteration]
+        if row.get("kept_score", math.nan) >= 0.0:
+            score = row["kept_score"]
         content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
         # A full disk ends a run at its next checkpoint, not here.
         with suppress(ResultsError):

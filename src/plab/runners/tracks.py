@@ -57,6 +57,8 @@ class Step:
         seconds: The run's share of the wall time; None: all of it.
         keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
         whole: Actions were run to the end; those that were not are never the best.
+        best: Actions that are the best from now on, of an earlier iteration perhaps, that iteration and its
+            loss; None: by the family's ranking.
     """
 
     measures: Mapping[str, float]
@@ -69,6 +71,7 @@ class Step:
     seconds: float | None = None
     keep: bool = False
     whole: bool = True
+    best: tuple[np.ndarray, int, float] | None = None
 
 
 class Track:
@@ -188,10 +191,16 @@ class Track:
         # Of several with the highest score the one of lowest loss.
         if self._by_score and row["score"] != self._best_score:
             better = row["score"] > self._best_score
+        chosen = (step.actions, self.iteration, row["loss"]) if better and step.whole else step.best
         best: dict[str, Any] = {}
-        if better and step.whole:
-            self.best_loss, self.best_actions, self._best_score = row["loss"], step.actions, row["score"]
-            best = {"best_actions": step.actions, "best_iteration": self.iteration, "best_loss": row["loss"]}
+        if chosen is not None:
+            self.best_actions, iteration, self.best_loss = chosen
+            self._best_score = row["score"]
+            best = {
+                "best_actions": self.best_actions,
+                "best_iteration": iteration,
+                "best_loss": self.best_loss,
+            }
         self.run.record(row, step.state, keep=step.keep, **best)
         self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
         self.iteration += 1

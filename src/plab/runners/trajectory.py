@@ -21,6 +21,9 @@ from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule, family
 from plab.runners.runner import Runner, Step, Track, measures, shared_problem
 
+CHECK = 10
+"""Iterations after which the best actions since the last check are run in the hard contact model."""
+
 
 @dataclass
 class TrajectoryConfig(MethodConfig):
@@ -68,9 +71,13 @@ class TrajectoryRunner(Runner):
     def build(self) -> None:
         """Make the problem, with an environment per run."""
         self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
+        self._set_contact()
+        self._rules: dict[int, UpdateRule] = {}
+        self._finalists: dict[int, Finalists] = {}
+
+    def _set_contact(self) -> None:
         methods = [track.cfg.method_as(TrajectoryConfig) for track in self.tracks]
         self.problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
-        self._rules: dict[int, UpdateRule] = {}
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Draw the first actions, or take those of the file."""
@@ -78,9 +85,11 @@ class TrajectoryRunner(Runner):
         method = track.cfg.method_as(TrajectoryConfig)
         kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
         rule = self._rules[track.number] = kind(method, (scene.horizon, scene.action_dim), track.cfg.seed)
+        finalists = self._finalists[track.number] = Finalists()
         if state is not None:
             rule.actions = np.array(state["actions"])
             rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
+            finalists.restore(state.get("finalists", {}))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Run the actions of all, and improve those of each by their gradient."""
@@ -89,20 +98,148 @@ class TrajectoryRunner(Runner):
         for track in tracks:
             tried[track.number] = self._rules[track.number].actions
         episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
-        share = (time.perf_counter() - start) / len(tracks)
+        rows: dict[Track, dict[str, float]] = {}
         for track in tracks:
             number = track.number
             if number in episodes.failures:
                 track.fail(episodes.failures[number])
                 continue
-            start = time.perf_counter()
             gradient = cast(np.ndarray, episodes.gradient)[number]
-            rule = self._rules[number]
-            rule.step(gradient)
-            measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
-            done = measured, tried[number], {"actions": rule.actions, "optimizer": dict(rule.state)}
-            seconds = share + time.perf_counter() - start
-            yield track, Step(*done, steps_forward=0, steps_gradient=len(gradient), seconds=seconds)
+            self._rules[number].step(gradient)
+            rows[track] = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
+            self._finalists[number].add(tried[number], track.iteration, rows[track])
+        # As the release has it, the last iteration counts, whatever is kept.
+        judging = [track for track in rows if track.cfg.protocol.score != "last"]
+        checks = self._check([track for track in judging if self._is_due(track)])
+        share = (time.perf_counter() - start) / len(tracks)
+        for track, row in rows.items():
+            rule, finalists = self._rules[track.number], self._finalists[track.number]
+            kept = finalists.keep_best() if track in checks else None
+            if track in checks and self.iterations(track) == track.iteration + 1:
+                track.run.result.provenance["lowest_loss_score"] = finalists.lowest.hard_score
+            yield (
+                track,
+                Step(
+                    row | {"kept_score": finalists.kept_score},
+                    tried[track.number],
+                    {
+                        "actions": rule.actions,
+                        "optimizer": dict(rule.state),
+                        "finalists": finalists.state(),
+                    },
+                    steps_forward=checks.get(track, 0) * len(rule.actions),
+                    steps_gradient=len(rule.actions),
+                    seconds=share,
+                    # Until the first check those of the lowest loss are kept.
+                    whole=np.isnan(finalists.kept_score) or track not in judging,
+                    best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
+                ),
+            )
+
+    def _is_due(self, track: Track) -> bool:
+        return (track.iteration + 1) % CHECK == 0 or track.iteration + 1 == self.iterations(track)
+
+    def _check(self, tracks: Sequence[Track]) -> dict[Track, int]:
+        """Score finalists of some runs in the hard contact model; return the rollouts of each run."""
+        rounds: list[dict[int, Finalist]] = [{}, {}]
+        for track in tracks:
+            finalists, last = self._finalists[track.number], track.iteration + 1 == self.iterations(track)
+            chosen = [finalists.highest, *([finalists.lowest] if last else [])]
+            for one, own in zip(chosen, rounds, strict=False):
+                if track.cfg.method.contact == "hard":
+                    one.hard_score = one.score
+                else:
+                    own[track.number] = one
+        for own in filter(None, rounds):
+            tried = self.actions_at_rest()
+            for number, one in own.items():
+                tried[number] = one.actions
+            self.problem.simulator.set_contact("hard")
+            judged = self.problem.rollout(tried, gradient=False, strict=False, exact=False)
+            self._set_contact()
+            for number, one in own.items():
+                one.hard_score = -1.0 if number in judged.failures else judged.scores[number].score
+        return {track: sum(track.number in own for own in rounds) for track in tracks}
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report the loss, and the score of the actions that are kept; see :class:`Finalists`."""
+        if all(track.cfg.protocol.score == "last" for track in tracks):
+            super().tell(rows, tracks)
+            return
+        mean = "" if len(rows) == 1 else "mean "
+        text = f"{mean}loss {np.mean([row['loss'] for row in rows]):.5g}"
+        if (kept := np.mean([row["kept_score"] for row in rows])) >= 0.0:
+            text += f" score of the best actions {kept:.3f}"
+        self.report(min(track.iteration for track in tracks), text)
+
+
+@dataclass
+class Finalist:
+    """Actions, shape [T, A], their iteration, loss and score there, and their score in the hard contact model
+    once that is known."""
+
+    actions: np.ndarray
+    iteration: int
+    loss: float
+    score: float
+    hard_score: float = np.nan
+
+
+class Finalists:
+    """Actions of a run that may be kept.
+
+    Scores of rows are of their contact model. The actions of the highest since the last check are run in the
+    hard one, after the last iteration those of the lowest loss of the run, too; kept are those of the highest
+    score there, and of several the ones of lowest loss.
+
+    Attributes:
+        kept_score: Score of the actions that are kept, in the hard contact model; NaN before the first check.
+    """
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._named: dict[str, Finalist] = {}
+        self.kept_score, self._kept_loss = np.nan, np.nan
+
+    @property
+    def highest(self) -> Finalist:
+        """Actions of the highest score since the last check."""
+        return self._named["highest"]
+
+    @property
+    def lowest(self) -> Finalist:
+        """Actions of the lowest loss."""
+        return self._named["lowest"]
+
+    def add(self, actions: np.ndarray, iteration: int, row: Mapping[str, float]) -> None:
+        """Consider the actions of an iteration."""
+        new = Finalist(actions.copy(), iteration, row["loss"], row["score"])
+        ranks = {"highest": lambda one: (-one.score, one.loss), "lowest": lambda one: one.loss}
+        for name, rank in ranks.items():
+            if name not in self._named or rank(new) < rank(self._named[name]):
+                self._named[name] = new
+
+    def keep_best(self) -> Finalist | None:
+        """Return the checked finalist that is better than what is kept, if any, and forget the highest."""
+        best = None
+        for one in (self._named.pop("highest"), self._named["lowest"]):
+            better = not one.hard_score <= self.kept_score or (
+                one.hard_score == self.kept_score and one.loss < self._kept_loss
+            )
+            if one.hard_score >= 0.0 and better:
+                best, self.kept_score, self._kept_loss = one, one.hard_score, one.loss
+        return best
+
+    def state(self) -> dict[str, Any]:
+        """Return everything as arrays and numbers."""
+        named = {name: vars(one) for name, one in self._named.items()}
+        return named | {"kept_score": self.kept_score, "kept_loss": self._kept_loss}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        for name in {"highest", "lowest"} & state.keys():
+            self._named[name] = Finalist(**state[name])
+        self.kept_score, self._kept_loss = (float(state.get(f"kept_{n}", np.nan)) for n in ("score", "loss"))
 
 
 class UpdateRule:
@@ -175,7 +312,8 @@ FAMILY = Family(
     label="a sequence of actions, improved by its gradient",
     config=TrajectoryConfig,
     runner=TrajectoryRunner,
-    columns=("gradient_norm",),
+    columns=("gradient_norm", "kept_score"),
+    may_be_nan=("kept_score",),
     batching=True,
     rules={"adam": Rule(Adam), "gd": Rule(Momentum)},
     kind=GRADIENT,

@@ -262,6 +262,8 @@ def _measure(run: Run) -> None:
         return
     run.done = int(done[-1])
     run.score = float(table["score"][min(summary["best_iteration"], len(seconds) - 1)])
+    if "kept_score" in table and table["kept_score"][-1] >= 0.0:
+        run.score = float(table["kept_score"][-1])
     # The first row of a process compiles the kernels.
     count = min(_RECENT_ROWS, len(seconds) - 1)
     if count and run.done > int(done[-1 - count]):
