@@ -104,5 +104,5 @@ def _keys(path: Path, width: int) -> Iterator[tuple[str, str]]:
         if parents[0] in ("defaults", "hydra") or (len(parents) > 1 and parents[0] == "variants"):
             continue
         key = prefix + ".".join(parents)
-        value = re.sub(r"^[&*]\w+|^\$\{.*", "", match["value"].strip())
+        value = re.sub(r"^[&*]\w+|.*\$\{.*", "", match["value"].strip())
         yield key, f"  {f'{key}={value}' if value else key:<{width}} {match['comment'] or ''}".rstrip()
