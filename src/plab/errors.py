@@ -49,7 +49,7 @@ def tell(message: str) -> None:
 
 
 def out_of_memory(error: MemoryError) -> str:
-    """Return one line about lacking memory; Python's own error says nothing."""
+    """Return one line about lacking memory; Python's own error is empty."""
     return str(error) or "this computer has too little memory for that: close something, or ask for less"
 
 

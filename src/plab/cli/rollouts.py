@@ -142,7 +142,7 @@ def export(argv: Sequence[str]) -> None:
     plab export RESULT_FILE [--format vtk|ply] [--output FOLDER]
     plab export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
 
-    What is written into the folder:
+    Content of the folder:
       vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
       ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
     Both hold the target's surface, too.

@@ -1,4 +1,4 @@
-"""Tables: how all command lines print and write them."""
+"""Tables as all commands print and write them."""
 
 from __future__ import annotations
 

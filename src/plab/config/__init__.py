@@ -1,6 +1,6 @@
 """The configuration of a run: its types, how it is composed and checked, and which runs words choose.
 
-:func:`load_config` composes what ``conf/*.yaml`` and overrides say into a :class:`Config`. What it offers is
+:func:`load_config` composes what ``conf/*.yaml`` and overrides say into a :class:`Config`. Its parts are
 imported when it is asked for: readers of results do without Hydra.
 """
 

@@ -318,10 +318,6 @@ def build_scene(cfg: Config) -> Scene:
     if cfg.variant not in task.variants:
         advice = pick(cfg.variant, list(task.variants))
         raise ConfigError(f"variant {cfg.variant} of task {task.name} does not exist; {advice}")
-    most = max((body.particles for body in task.bodies.values()), default=1)
-    if most * sim.particles_scale < 0.5:
-        least = f"use {0.5 / most:.2g} or more"
-        raise ConfigError(f"sim.particles_scale={sim.particles_scale:g} leaves no particle: {least}")
     scene = Scene(
         name=task.name,
         bodies=task.build_bodies(sim.particles_scale),

@@ -83,7 +83,7 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 def _same(value: Any, text: str) -> bool:
-    """Return whether a configuration's value is what the text says: numbers by value, all else by letter."""
+    """Return whether a configuration's value equals a text: numbers by value, all else by letter."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower() == text.lower()
     try:

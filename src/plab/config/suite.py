@@ -46,7 +46,7 @@ def group_names(group: str) -> list[str]:
 
 @functools.cache
 def shipped_file(group: str, name: str) -> Mapping[str, Any]:
-    """Return what one of plab's own files says, over those that it is based on; nothing if there is none."""
+    """Return the content of one of plab's own files merged over its bases; nothing if there is none."""
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}

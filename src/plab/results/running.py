@@ -68,7 +68,7 @@ class RunFile:
         """Open the file of a configuration's run.
 
         Raises:
-            RunBusyError: If somebody else computes the run.
+            RunBusyError: If another process computes the run.
             NewerSchemaError: If a later plab has written a file of the run.
             ResultsError: If the folder cannot be written or has no room, before anything is computed.
         """
@@ -363,7 +363,7 @@ def acquire(path: str | Path) -> Lock | None:
 
 
 def held(path: str | Path) -> bool:
-    """Return whether somebody computes a run at this moment, by its final or partial result file."""
+    """Return whether a process computes a run at this moment, by its final or partial result file."""
     file = lock_path(path)
     if not file.exists():
         return False

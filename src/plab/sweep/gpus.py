@@ -1,4 +1,4 @@
-"""Processes on all GPUs of this computer, each of which is given a batch whenever it is free."""
+"""Pool of processes on all GPUs of this computer, each given a batch whenever it is free."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ Kind: TypeAlias = tuple[str, str]
 """Task and family of methods: batches of one kind may share a simulator."""
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-"""The variable that tells a process which GPUs it has."""
 
 PATIENCE = 30.0
 """Time for processes to close their files after Ctrl-C [s]."""
@@ -37,12 +36,12 @@ def gpu_workers(
     """Start processes on all GPUs that this process may use; afterwards they end.
 
     Args:
-        per_gpu: Processes of each GPU.
-        most: Processes of all, at most.
-        look_up: Says how a run ended whose process was killed.
+        per_gpu: Number of processes of each GPU.
+        most: Largest number of processes.
+        look_up: Returns the outcome of a run whose process was killed.
 
     Yields:
-        What carries out batches by them, and the number of processes.
+        Function that carries out batches by them, and the number of processes.
 
     Raises:
         ConfigError: If there is no GPU.
@@ -69,7 +68,7 @@ def gpu_workers(
 def _carry(
     workers: Sequence[_Worker], batches: list[list[Config]], progress: Callable[[], str]
 ) -> Iterator[Outcome]:
-    """Give batches to whoever is free, say which runs have finished, and yield how each ended."""
+    """Give batches to free processes, print which runs have finished, and yield the outcomes."""
     waiting = list(batches)
     used = workers[: len(batches)]
     shown = any(cfg.progress for batch in batches for cfg in batch)
@@ -113,9 +112,9 @@ class _Worker:
 
     Attributes:
         name: The GPU.
-        label: What stands before its progress.
-        batch: What it is carrying out, empty if nothing.
-        kind: Of what kind that is, or what it has carried out last.
+        label: Name before its progress.
+        batch: Batch that it carries out; empty if none.
+        kind: Kind of that batch, or of the last one.
     """
 
     def __init__(self, name: str, label: str, look_up: Callable[[Config], Outcome]) -> None:
@@ -142,7 +141,7 @@ class _Worker:
         self.connection.send((batch, note))
 
     def messages(self) -> Iterator[tuple[Any, ...]]:
-        """Yield what it has said: how far it has come, or how the runs of its batch ended."""
+        """Yield its messages: progress, or the outcomes of its batch."""
         try:
             while self.connection.poll():
                 message = self.connection.recv()
@@ -157,13 +156,13 @@ class _Worker:
             yield "ended", outcomes
 
     def dismiss(self) -> None:
-        """Let it end; one that is at work is interrupted."""
+        """End the process; one that is at work is interrupted."""
         self.connection.close()
         if self.batch:
             self.process.terminate()
 
     def end(self) -> None:
-        """Wait until it has closed its files, and kept what it has compiled."""
+        """Wait until its files are closed and its kernels cached."""
         # One that was never given anything may be loading still.
         self.process.join(PATIENCE if self.kind else 0.0)
         self.process.kill()
@@ -176,7 +175,7 @@ def _work(name: str, connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # What is to be seen is shown by the process that has started this one.
+    # The process that has started this one shows the progress.
     sys.stdout = open(os.devnull, "w")
     forward_to(lambda *content: connection.send(content))
     cache = SimulatorCache()
