@@ -1,7 +1,7 @@
-"""The configuration of a run: its types, how it is composed and checked, and which runs words choose.
+"""Configuration of a run: types, composition, checks, and selection of runs.
 
-:func:`load_config` composes what ``conf/*.yaml`` and overrides say into a :class:`Config`. Its parts are
-imported when it is asked for: readers of results do without Hydra.
+:func:`load_config` composes the values of ``conf/*.yaml`` and overrides into a :class:`Config`. Names are
+imported on first use: readers of results do without Hydra.
 """
 
 from importlib import import_module
