@@ -8,7 +8,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -67,7 +66,7 @@ class Run:
     rate: float | None = None
     seconds: float = 0.0
     left: float | None = None
-    together: float = 1.0
+    together: int = 1
     path: str = ""
 
     @property
@@ -126,7 +125,7 @@ class Survey:
 
     @property
     def workers(self) -> int:
-        """Approximate number of processes at work: runs of a batch share one."""
+        """Number of processes at work: runs of a batch share one."""
         return max(round(sum(1.0 / run.together for run in self.running)), 1) if self.running else 0
 
     @property
@@ -257,7 +256,7 @@ def _measure(run: Run) -> None:
         # It may just have ended, and its partial file be gone.
         return
     run.seconds = float(sum(summary["wall_time"].values()))
-    run.together = _together(summary["provenance"], written, run.seconds)
+    run.together = summary["provenance"].get("batch", 1)
     if len(seconds) == 0:
         return
     run.done = int(done[-1])
@@ -276,15 +275,6 @@ def _measure(run: Run) -> None:
     if latest.get("rows", 0) > len(seconds):
         run.done = int(latest["episodes" if "train_reward" in table else "rows"])
         run.score = latest["score"]
-
-
-def _together(origin: dict[str, Any], written: float, spent: float) -> float:
-    """Return how many runs share a process: wall time since the start over the run's own time, at least 1."""
-    if origin.get("resumed") or spent <= 0.0:
-        # The time between two processes is not known.
-        return 1.0
-    started = datetime.fromisoformat(origin["start_time"]).timestamp()
-    return max((written - started) / spent, 1.0)
 
 
 def _group(task: str, method: str, own: Sequence[Run]) -> Group:
