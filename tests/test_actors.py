@@ -272,7 +272,7 @@ def test_environments_that_break_off_teach_nothing(
 ) -> None:
     before = [parameter.clone() for parameter in training.network.parameters()]
     batch, learned = training.batch, []
-    try_out, imitate = batch.problem.try_out, training._imitate
+    try_out, imitate = batch.problem.try_out, training.imitate
 
     def breaking(actions: np.ndarray, gradient: bool) -> Trials:
         trials = try_out(actions, gradient=gradient)
@@ -280,7 +280,7 @@ def test_environments_that_break_off_teach_nothing(
         return replace(trials, failures={e: f"environment {e}: broke off" for e in broken})
 
     monkeypatch.setattr(batch.problem, "try_out", breaking)
-    monkeypatch.setattr(training, "_imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
+    monkeypatch.setattr(training, "imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
     training.cycle()
     # Each of the three episodes with gradient.
     assert len(training.broken) == 3 * len(broken)
