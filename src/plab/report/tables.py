@@ -140,7 +140,9 @@ def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
             sides = [(cell.ours, cell.expected) if form == "ours" else (cell.paper, 0) for cell in line]
             shown.append([*key, *(_text(*side) for side in sides)])
             where = dict(zip(columns, key, strict=True))
-            data += [where | {"method": m} | _numbers(*side) for m, side in zip(methods, sides, strict=True)]
+            data += [
+                {**where, "method": m, **_numbers(*side)} for m, side in zip(methods, sides, strict=True)
+            ]
             bold.append([False] * len(columns) + _best(sides, methods))
         labels = [*columns, *(method(m).label for m in methods)]
         notes = [f"Mean ± standard deviation {what}.", _BOLD, *more]
@@ -159,7 +161,7 @@ def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
         compared.append(where | {"method": method(m).label} | texts)
         own = {f"paper_{k}": v for k, v in _numbers(cell.paper, 0).items()}
         gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
-        data.append(where | {"method": m} | _numbers(cell.ours, cell.expected) | own | gaps)
+        data.append({**where, "method": m, **_numbers(cell.ours, cell.expected), **own, **gaps})
     notes = [_DIFFERENCE, *settings_note(runs)]
     shown, title = pd.DataFrame(compared), f"{title}, compared"
     return [*made, Table(name, "comparison", title, shown, pd.DataFrame(data), None, notes, True)]

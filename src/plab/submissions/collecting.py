@@ -40,7 +40,8 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
         SubmissionError: If there is nothing, or something twice.
         plab.results.ResultsError: If something cannot be read.
     """
-    found: dict[Configuration, tuple[Path, list[Entry]]] = {}
+    found: dict[Configuration, Path] = {}
+    entries: list[Entry] = []
     for source in sources:
         recordings = submission_files(source)
         groups = [(path, list(read(path).entries)) for path in recordings]
@@ -50,15 +51,16 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
                 raise unreadable[0]
             finished = (row for row in rows if row.values["status"] == "finished")
             groups = [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
-        for path, entries in groups:
-            for configuration in {entry.configuration for entry in entries}:
-                if configuration in found:
-                    both, name = f"{path} and {found[configuration][0]}", configuration.name
-                    raise SubmissionError(f"{both} are both of {name}: submit one training of each")
-                found[configuration] = path, [e for e in entries if e.configuration == configuration]
-    if not found:
+        for path, own in groups:
+            for entry in own:
+                other, name = found.setdefault(entry.configuration, path), entry.configuration.name
+                if other != path:
+                    both = f"{path} and {other} are both of {name}"
+                    raise SubmissionError(f"{both}: submit one training of each")
+            entries += own
+    if not entries:
         raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
-    return [entry for configuration in sorted(found) for entry in found[configuration][1]]
+    return sorted(entries, key=lambda entry: entry.configuration)
 
 
 def _of_run(row: Row) -> Entry:

@@ -154,7 +154,7 @@ def build_targets(
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
     """Return the scene that a target is made from: draw 0 of the particles, in the recipe's material."""
-    material = recipe.material if isinstance(recipe, scripted.Script) else {}
+    material: dict[str, Any] = recipe.material if isinstance(recipe, scripted.Script) else {}
     made_from = replace(scene, particle_seed=0, **material)
     if material:
         try:
