@@ -533,11 +533,9 @@ class CudaPhases(OrderPhases, PosePhases):
         unit = self.momentum_scale(-1)
         total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
         # A test of which of a few manipulators are near would cost a thread as much as contact with them.
-        near = 0
+        near = (1 << self.manipulators) - 1
         if ti.static(self.manipulators > FEW):
             near = self.near_block(w, e, s, block)
-        else:
-            near = ti.static((1 << self.manipulators) - 1)
         v = self.update_node(e, s, self.node_of_block(block, r), near, total)
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
 
