@@ -179,9 +179,6 @@ def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vec
     assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
         assert getattr(vector, name) == getattr(reference, name)
-    assert data_equivalence(vector.reset(seed=0), reference.reset(seed=0), exact=True)
-    for actions in random_actions(2 * HORIZON + 1):
-        assert data_equivalence(vector.step(actions), reference.step(actions), exact=True)
     others, tested = DummyVecEnv(makers), PlabVecEnv(vector.batch)
     assert tested.observation_space == others.observation_space
     np.testing.assert_array_equal(tested.reset(), others.reset())

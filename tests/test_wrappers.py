@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import plab
+from plab.envs.goals import GoalEnv
 from plab.envs.sb3 import PlabVecEnv
 from suite import make_not_finite
 
@@ -97,6 +98,27 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
     env.close()
     assert alone[0].reset()[1]["success"] is False
     assert alone[0].spec.max_episode_steps == HORIZON
+
+
+def test_goals_agree_with_hindsight() -> None:
+    names = ["state", "mass", "target_mass", "target_points"]
+    ranges = {"target": {"bodies": {"ball": {"center": [[0.4, 0.3, 0.4], [0.7, 0.5, 0.75]]}}}}
+    env = GoalEnv(plab.make("Move", overrides=COARSE, observe=names, randomize=ranges))
+    first, _ = env.reset(seed=0)
+    assert env.observation_space.contains(first) and first["achieved_goal"].sum() == pytest.approx(1.0)
+    seen, reward, *_ = env.step(np.ones(6))
+    again = env.compute_reward(
+        np.stack([seen["achieved_goal"]] * 2), np.stack([seen["desired_goal"]] * 2), {}
+    )
+    assert again == pytest.approx([reward] * 2) and -1.0 <= reward < 0.0
+    assert env.compute_reward(seen["achieved_goal"], seen["achieved_goal"], {}) == 0.0
+    # The goal is where the target is, in every episode.
+    center = env.unwrapped.batch.configs[0].task.target["bodies"]["ball"]["center"]
+    for options in ({"target.bodies.ball.center": [0.45, 0.4, 0.5]}, {"target.bodies.ball.center": center}):
+        env.reset(options=options)
+        points = env.env.reset(options=options)[0]["target_points"]
+        np.testing.assert_allclose(points.mean(axis=0), options["target.bodies.ball.center"], atol=0.02)
+    env.close()
 
 
 def test_wrappers_of_environments(alone) -> None:

@@ -21,8 +21,11 @@ __all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "sp
 
 PICTURES = ("depth", "rgb", "segmentation")
 
-OBSERVATIONS = ("state", "particles", "points", *PICTURES)
+OBSERVATIONS = ("state", "particles", "points", "mass", "target_mass", "target_points", *PICTURES)
 """Names of what can be observed."""
+
+CELLS = 16
+"""Cells per axis of ``mass`` and ``target_mass``."""
 
 DEFAULT_CAMERAS = {"front": Camera((0.5, 0.9, 1.7), (0.5, 0.15, 0.5), 45.0)}
 """Cameras of environments that are given none."""
@@ -174,6 +177,11 @@ class Sensors:
         if "points" in self.names:
             self._points = SurfacePoints(simulator, points)
             spaces["points"] = Box(0.0, 1.0, (points, 4 if self._cameras else 3), np.float32)
+        for name in {"mass", "target_mass"} & set(self.names):
+            spaces[name] = Box(0.0, 1.0, (CELLS,) * 3, np.float32)
+        if "target_points" in self.names:
+            spaces["target_points"] = Box(0.0, 1.0, (points, 3), np.float32)
+        self._point_count, self._known_target = points, np.empty(0)
         for name, camera in self.cameras.items():
             width, height = camera.size
             known: dict[str, Space[Any]] = {
@@ -203,12 +211,30 @@ class Sensors:
         if "particles" in self.names:
             x = cast(Simulator, self._simulator).observe(1, like)[..., :3]
             out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
+        if "mass" in self.names:
+            out["mass"] = _shares(cast(Simulator, self._simulator).observe(1, like)[..., :3])
+        for name, values in self._target_observations().items():
+            known = values.like(like)
+            out[name] = known.float() if on_device(known) else known.astype(np.float32)
         if self._points is not None:
             out["points"] = self._points(list(self._cameras.values()), like)
         for name, sensor in self._cameras.items() if self._pictures else ():
             for picture, values in sensor.capture(*self._pictures, like=like).items():
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
         return next(iter(out.values())) if self._alone else out
+
+    def _target_observations(self) -> dict[str, Constants]:
+        """Return what is observed of the targets, made anew when they change."""
+        names = {"target_mass", "target_points"} & set(self.names)
+        masses = cast(Simulator, self._simulator).target_mass if names else self._known_target
+        if masses is not self._known_target:
+            self._known_target, made = masses, {}
+            if "target_mass" in names:
+                made["target_mass"] = np.stack([coarse_shares(mass) for mass in masses])
+            if "target_points" in names:
+                made["target_points"] = np.stack([_sampled(mass, self._point_count) for mass in masses])
+            self._targets = {name: Constants(values) for name, values in made.items()}
+        return self._targets if names else {}
 
     def noisy(
         self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
@@ -223,7 +249,7 @@ class Sensors:
         """
 
         def one(name: str, values: Array, space: Box) -> Array:
-            if name.endswith(("rgb", "segmentation")):
+            if name.endswith(("rgb", "segmentation", "mass", "target_points")):
                 return values
             noise = np.stack([rng.standard_normal(space.shape, np.float32) for rng in rngs])
             noise *= deviations.astype(np.float32).reshape(-1, *[1] * len(space.shape))
@@ -244,6 +270,38 @@ class Sensors:
             return one(self.names[0], observation, cast(Box, self.space))
         spaces = cast(Dict, self.space).spaces
         return {name: one(name, values, cast(Box, spaces[name])) for name, values in observation.items()}
+
+
+def coarse_shares(mass: np.ndarray) -> np.ndarray:
+    """Return the share of a mass tensor, shape [n, n, n], in each of :data:`CELLS` cells per axis."""
+    first = np.ceil(np.arange(CELLS) * len(mass) / CELLS).astype(int)
+    for axis in range(3):
+        mass = np.add.reduceat(mass, first, axis=axis)
+    return mass / mass.sum()
+
+
+def _shares(x: Array) -> Array:
+    """Return the share of particles, shape [batch, particle, 3], in each cell, float32."""
+    device = on_device(x)
+    cell = ((x * CELLS).long() if device else (x * CELLS).astype(np.int64)).clip(0, CELLS - 1)
+    flat = (cell[..., 0] * CELLS + cell[..., 1]) * CELLS + cell[..., 2]
+    whole, batch, size = CELLS**3, len(x), x.shape[1]
+    if device:
+        import torch
+
+        flat = (flat + whole * torch.arange(batch, device=x.device)[:, None]).reshape(-1)
+        return (torch.bincount(flat, minlength=batch * whole).float() / size).reshape(batch, *(CELLS,) * 3)
+    counts = np.bincount((flat + whole * np.arange(batch)[:, None]).reshape(-1), minlength=batch * whole)
+    return (counts / size).astype(np.float32).reshape(batch, *(CELLS,) * 3)
+
+
+def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
+    """Return points drawn from a mass tensor, always the same ones, shape [count, 3]."""
+    rng = np.random.default_rng(0)
+    share = mass.clip(0.0).reshape(-1)
+    nodes = rng.choice(share.size, count, p=share / share.sum())
+    place = np.stack(np.unravel_index(nodes, mass.shape), axis=1) + rng.uniform(-0.5, 0.5, (count, 3))
+    return (place / len(mass)).clip(0.0, 1.0)
 
 
 def mapped(function: Callable[..., Any], *observations: Any) -> Any:

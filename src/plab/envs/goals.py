@@ -1,0 +1,61 @@
+"""Goal-conditioned view of an environment, as of Gymnasium-Robotics' ``GoalEnv``, for hindsight replay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Dict
+
+from plab.errors import ArgumentError
+
+__all__ = ["GoalEnv"]
+
+_NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "target_mass"}
+
+
+class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray], np.ndarray]):
+    """Environment with the observations ``observation``, ``achieved_goal`` and ``desired_goal``.
+
+    These are the state, where the mass is and where it is to be, in a coarse grid. Rewards are those of
+    :meth:`compute_reward`.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, np.ndarray]) -> None:
+        """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``.
+
+        Raises:
+            ValueError: If it does not.
+        """
+        super().__init__(env)
+        space = env.observation_space
+        if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):
+            raise ArgumentError('observe must hold "state", "mass" and "target_mass"')
+        self.observation_space = Dict({name: space.spaces[own] for name, own in _NAMES.items()})
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """Return minus the share of the mass that is in the wrong cell, for one goal or many.
+
+        Args:
+            achieved_goal: Shares of the mass in each cell, shape [..., cell, cell, cell].
+            desired_goal: Those of the target, same shape.
+            info: Ignored.
+        """
+        return -0.5 * np.abs(achieved_goal - desired_goal).sum(axis=(-3, -2, -1))
+
+    def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        return self._goals(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Advance by one step."""
+        observation, _, terminated, truncated, info = self.env.step(action)
+        seen = self._goals(observation)
+        reward = self.compute_reward(seen["achieved_goal"], seen["desired_goal"], info)
+        return seen, float(reward), terminated, truncated, info
+
+    @staticmethod
+    def _goals(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: observation[own] for name, own in _NAMES.items()}
