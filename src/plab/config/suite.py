@@ -14,7 +14,7 @@ from plab.errors import ConfigError
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 
-EXTENSION_TASKS = ("Gripper", "HandLift")
+EXTENSION_TASKS = ("Gripper", "HandLift", "HandPinch", "HandPress", "HandRoll")
 """Tasks beside the suite, with articulated models: in no table or default of the suite."""
 
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
