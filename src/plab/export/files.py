@@ -116,7 +116,7 @@ def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
         ``body``, its number; ``displacement`` since the start [domain units]; ``velocity`` [domain units /
         s]; ``volume_ratio``, the determinant of the deformation gradient; ``elastic_strain``, the norm of its
         deviatoric Hencky strain; ``yielding``, that strain divided by the one at which plasticine yields, 1
-        where it does (0 in purely elastic bodies). Vectors of shape [particle, 3], else [particle].
+        where it does (0 in bodies without a yield stress). Vectors of shape [particle, 3], else [particle].
     """
     if recording.v is None or recording.F is None:
         raise ValueError("the recording has no velocities and deformation gradients")
@@ -124,7 +124,10 @@ def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
     hencky = np.log(np.linalg.svd(F, compute_uv=False))
     strain = np.linalg.norm(hencky - hencky.mean(axis=1, keepdims=True), axis=1)
     # A yield stress of 0 is that of a fluid: everything yields.
-    limits = [max(m.yield_stress / (2.0 * m.shear_modulus), np.finfo(float).tiny) for m in scene.materials]
+    limits = [
+        max(m.values.get("yield_stress", np.inf) / (2.0 * m.shear_modulus), np.finfo(float).tiny)
+        for m in scene.materials
+    ]
     body = scene.particle_bodies
     return {
         "body": body,

@@ -111,7 +111,7 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
 
 def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
     """Return a scene whose bodies have these values, by name and body."""
-    shared = {name: column[0] for name, column in values.items() if name in MATERIAL_KEYS}
+    shared: dict[str, Any] = {name: column[0] for name, column in values.items() if name in MATERIAL_KEYS}
     bodies = []
     for body, material, *numbers in zip(scene.bodies, scene.materials, *values.values(), strict=True):
         own = {key: value for key, value in zip(values, numbers, strict=True) if key in material.kind.keys}
@@ -124,7 +124,7 @@ def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
     return replace(scene, bodies=tuple(bodies), **(shared if scene.material_count == 1 else {}))
 
 
-def parameter_gradient(material: Material, bars: np.ndarray, keys: Sequence[str]) -> list[float]:
+def parameter_gradient(material: Material, bars: Sequence[float], keys: Sequence[str]) -> list[float]:
     """Return derivatives by parameters from those by the coefficients of a material's law, shape
     [coefficient]; 0 for parameters that it has not."""
     law = material.kind

@@ -95,7 +95,8 @@ def stress_adjoint(
     trace = Trace()
     inputs = [*trace.inputs("d", 6), *trace.inputs("scalars", 2), *trace.inputs("parameters", 3)]
     bars, [scale] = trace.inputs("a_bar", 9), trace.inputs("scale", 1)
-    tau = von_mises.stress(inputs[:6], inputs[7], inputs[6], *inputs[8:], series)
+    mu, lam, limit = inputs[8:]
+    tau = von_mises.stress(inputs[:6], inputs[7], inputs[6], mu, lam, limit, series)
     a = scattered_matrix(tau, [0.0] * 9, scale, 0.0)
     given = dict(zip([*inputs, *bars, scale], [*d, c2, j, *parameters, *a_bar, stress_scale], strict=True))
     out = evaluated(derivatives(a, bars, inputs), given)

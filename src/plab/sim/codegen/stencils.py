@@ -87,7 +87,8 @@ class Sums:
 
     def take(self, i: int, grid: Sequence[Row]) -> None:
         """Add the three rows at an offset along x."""
-        times, along, of_y = self._code.times, None, None
+        times = self._code.times
+        along: Any = None
         for row, weight in zip(grid, self._wy, strict=True):
             along = times(row, weight, along)
         of_y = times(grid[2], self._twice[1], times(grid[1], self._wy[1]))
@@ -147,7 +148,8 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     momentum = code.field(value, [a[j::3] for j in range(3)], dx)
     value = [*code.lanes(args["stencil"], ADJOINT_FIELD), real(0.0)]
     adjoint = code.field(value, [c[j::3] for j in range(3)], four)
-    sums, slopes = Sums(code, w), [None, None, None]
+    sums = Sums(code, w)
+    slopes: list[Any] = [None, None, None]
     grids = rows_of(code, args["velocity"]), rows_of(code, args["momentum"])
     for i, (q, h) in enumerate(zip(code.over(momentum), code.over(adjoint), strict=True)):
         of_momentum = [code.read(place) for place in grids[1][i]]
