@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from plab.scenes import Manipulator, SceneError, vector3
 
@@ -69,6 +68,9 @@ class Joint:
 
     def matrix(self, position: float) -> np.ndarray:
         """Transform from its frame to the parent's, shape [4, 4]."""
+        # Imported here, as below: it takes half a second, and few scenes have a model.
+        from scipy.spatial.transform import Rotation
+
         own, axis, anchor = np.eye(4), np.array(self.axis), np.array(self.anchor)
         if self.hinge:
             own[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
@@ -127,6 +129,8 @@ class Chain:
 
     def manipulators(self, friction: float) -> tuple[Manipulator, ...]:
         """Links as manipulators of a scene, where they are at t = 0."""
+        from scipy.spatial.transform import Rotation
+
         frames = self.frames([joint.start for joint in self.joints])
         turns = Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
         wide: dict[str, Any] = {"lower_bound": (-1.0,) * 3, "upper_bound": (2.0,) * 3}
@@ -266,6 +270,8 @@ def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict
 
 def pose_matrix(position: ArrayLike, rotation: ArrayLike) -> np.ndarray:
     """Homogeneous transform, shape [4, 4], of a position and a quaternion w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
     matrix[:3, 3] = position

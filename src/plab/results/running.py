@@ -20,7 +20,6 @@ import platform
 import re
 import shutil
 import subprocess
-import tempfile
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -47,9 +46,6 @@ from plab.results.schema import (
 
 _PROGRESS_EVERY = 1.0
 """Interval at which a run writes its progress beside its file [s]."""
-
-_PROBE_BYTES = 4 << 20
-"""Room demanded in the results folder before a run starts: a partial, its successor and the final file."""
 
 _log = logging.getLogger(__name__)
 
@@ -94,9 +90,6 @@ class RunFile:
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # A file without a name, of which a process that is killed leaves nothing.
-            with tempfile.TemporaryFile(dir=self.path.parent) as probe:
-                probe.write(bytes(_PROBE_BYTES))
             self._lock_and_resume(config["force"])
         except OSError as error:
             self._let_go()
@@ -120,6 +113,9 @@ class RunFile:
             return
         self._found = set(self._files())
         self._known = self._state[0].rows
+        if not self.partial_path.exists():
+            # A run under way has a file from its start: for plab status, and as the folder may have no room.
+            write(self.result, self.partial_path)
 
     def _clear_up(self) -> None:
         """Remove files left by a process that was killed just after it had finished the run."""
@@ -145,7 +141,7 @@ class RunFile:
 
         Files of an earlier process stay.
         """
-        if self._lock is not None and not self.partial_path.exists():
+        if self._lock is not None and not self.result.rows:
             for path in set(self._files()) - self._found:
                 if path.is_dir():
                     shutil.rmtree(path, ignore_errors=True)

@@ -175,13 +175,3 @@ def row_count(method: Mapping[str, Any]) -> int | None:
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")
-
-
-def parse_member(path: Path) -> dict[str, str] | None:
-    """Return task, variant, method and seed that a path made by :func:`member_name` tells, with any suffix;
-    None for others."""
-    found = re.fullmatch(
-        r"(?P<task>.+)-v(?P<variant>[^/]+)/(?P<method>[^/]+)/seed(?P<seed>\d+)-[0-9a-f]{8}\..+",
-        "/".join(path.parts[-3:]),
-    )
-    return None if found is None else found.groupdict()

@@ -16,8 +16,7 @@ from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
 from plab.results.running import held
-from plab.results.schema import parse_member
-from plab.results.table import readable_rows, sources_of
+from plab.results.table import readable_rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; ``interrupted`` resumes when its command is given again."""
@@ -158,11 +157,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
-    begun = {key for root in sources_of(source) for key in _begun(root)}
     present = {_key(row.values) for row in fitting}
-    if not chosen.keys:
-        # Of a run without a file only its name is known.
-        present |= {key for key in begun if chosen(dict(zip(NAMES, key, strict=True)), {})}
     runs = {key: Run(*key) for key in _expected(present, chosen, missing)}
     others = 0
     for row in fitting:
@@ -172,9 +167,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
         if run is not None:
             _take(run, row)
     groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
-    for key, run in runs.items():
-        if key in begun and run.state != "done":
-            run.state = "running"
+    for run in runs.values():
         groups[run.task, run.method].append(run)
     return Survey(
         list(runs.values()),
@@ -231,14 +224,6 @@ def _take(run: Run, row: Row) -> None:
     run.done = run.total if state == "done" else int(row.values["iterations"])
     if state == "running":
         _measure(run)
-
-
-def _begun(source: Path) -> Iterable[Key]:
-    """Yield runs under way, also those that have no file yet."""
-    for lock in source.rglob("*.lock") if source.is_dir() else ():
-        names = parse_member(lock)
-        if names is not None and held(lock.with_suffix(".h5")):
-            yield _key(names)
 
 
 # -------------------------------------------------------------------------------------------------- estimates
