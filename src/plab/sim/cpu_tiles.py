@@ -309,7 +309,7 @@ class TilePhases(ParticlePhases):
         the new F is stored if ``update``."""
         for number, law in ti.static(enumerate(self.laws)):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(law)):
+                if ti.static(self.scheduled(law.name)):
                     self.scheduled_tile(state, state_at, source, target, entry9, e, at, law, number, update)
                 else:
                     self.law_tile(state_at, source, target, entry9, e, at, law, number, update)
@@ -402,7 +402,7 @@ class TilePhases(ParticlePhases):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
         for number, law in ti.static(enumerate(self.laws)):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(law)):
+                if ti.static(self.scheduled(law.name)):
                     self.scheduled_tile_adjoint(
                         state, state_at, source, bar, bar_at, target, entry9, e, at, law, number
                     )

@@ -222,7 +222,7 @@ class CudaPhases(OrderPhases, PosePhases):
         constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
         function = ti.static(self.function(law, "particle"))
         served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(law)):
+        if ti.static(self.scheduled(law.name)):
             ends = variables(self.real, ti.static(self.range_of_series()))
             function(*a, *f_new, *coefficients, *constants, *ends, served)
         else:
@@ -233,7 +233,7 @@ class CudaPhases(OrderPhases, PosePhases):
                 if ti.static(update):
                     state[target + AT_F + i][lane] = f_new[i]
         else:
-            if ti.static(self.scheduled(law)):
+            if ti.static(self.scheduled(law.name)):
                 out = self.spectral_material(state, source, target, lane, e, update)
         return out
 
@@ -274,7 +274,7 @@ class CudaPhases(OrderPhases, PosePhases):
         constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
         function = ti.static(self.function(law, "particle_adjoint"))
         served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(law)):
+        if ti.static(self.scheduled(law.name)):
             ends = variables(self.real, ti.static(self.range_of_series()))
             function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
         else:
@@ -289,7 +289,7 @@ class CudaPhases(OrderPhases, PosePhases):
                 bar[target + AT_C + i][lane] = c_out[i]
                 bar[target + AT_F + i][lane] = f_out[i]
         else:
-            if ti.static(self.scheduled(law)):
+            if ti.static(self.scheduled(law.name)):
                 self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     @ti.func

@@ -8,7 +8,7 @@ one per axis, also 4-vectors: three components of momentum or velocity and the m
 from collections.abc import Callable
 from typing import Any
 
-from plab.laws import LAWS, Law
+from plab.laws import Law
 from plab.sim.codegen.bitcode import bitcode_file, symbol
 from plab.sim.compiler import bitcode_function, ti
 from plab.sim.spectral import (
@@ -89,9 +89,10 @@ class ParticlePhases(Storage):
         path = bitcode_file(self.code_device, precision, unit, len(self.laws) > 1)
         return bitcode_function(path, symbol(unit, name, ENDINGS[real] if real else precision))
 
-    def scheduled(self, law: Law) -> bool:
-        """Whether a law has a schedule of its own, with singular values beyond the range of its series."""
-        return law is LAWS["von_mises"]
+    def scheduled(self, law: str) -> bool:
+        """Return True if a law has a schedule of its own, with singular values beyond its series' range."""
+        # By its name: Quadrants passes a dataclass field by field.
+        return law == "von_mises"
 
     # -- access to the particle state ---------------------------------------------------------------
 

@@ -26,18 +26,19 @@ from typing import TYPE_CHECKING
 from plab import laws
 from plab.files import cache_dir
 from plab.laws import Law
+from plab.sim.compiler import QUADRANTS
 
 if TYPE_CHECKING:
     from plab.sim.codegen.materials import Maker
 
-X86 = "p270:32:32-p271:32:32-p272:64:64-i64:64-f80:128-n8:16:32:64-S128"
+X86 = f"p270:32:32-p271:32:32-p272:64:64-i64:64-{'i128:128-' if QUADRANTS else ''}f80:128-n8:16:32:64-S128"
 LAYOUTS = {
     "linux-x86_64": f"e-m:e-{X86}",
     "win32-amd64": f"e-m:w-{X86}",
     "darwin-x86_64": f"e-m:o-{X86}",
     "darwin-arm64": "e-m:o-i64:64-i128:128-n32:64-S128",
 }
-"""Data layouts of the platforms that Taichi has wheels for."""
+"""Data layouts of the platforms that Taichi has wheels for; Quadrants' LLVM aligns i128, too."""
 
 PLATFORM = f"{sys.platform}-{platform.machine().lower()}"
 
@@ -56,7 +57,7 @@ def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = Fal
         plab.sim.DeviceError: If it has to be written, and llvmlite does not load; one line.
     """
     code = None
-    digest = hashlib.sha256(repr((_sources(), PLATFORM, device, precision, mixed)).encode())
+    digest = hashlib.sha256(repr((_sources(), LAYOUTS.get(PLATFORM), device, precision, mixed)).encode())
     if isinstance(unit, Law):
         try:
             digest.update(
@@ -116,7 +117,6 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
     except ImportError as error:
         raise _unsupported(f"plab compiles its laws with llvmlite, which does not load: {error}") from None
     from plab.sim.codegen import materials, stencils
-    from plab.sim.compiler import QUADRANTS
 
     if llvm.llvm_version_info[0] > 16 and not QUADRANTS:
         raise _unsupported(
