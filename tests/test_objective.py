@@ -14,6 +14,8 @@ from hypothesis.extra.numpy import arrays
 from plab.objective import (
     TARGET_ENTRIES,
     batch_scores,
+    chamfer_distance,
+    earth_movers_distance,
     mass_change,
     rewards,
     score_scale,
@@ -188,3 +190,19 @@ def test_mass_at_a_wall_is_smoothed_into_the_void():
     change = mass_change(start, target)
     assert change.clip(0.0).sum() == pytest.approx(1.0, abs=1e-3)
     assert (-change).clip(0.0).sum() < 0.5
+
+
+def test_distances_of_shapes_are_the_way_between_them():
+    rng, (a, b) = np.random.default_rng(0), np.zeros((2, 32, 32, 32))
+    a[4:8, 4:8, 4:8] = rng.random((4, 4, 4)) + 0.1
+    b[20:24, 4:8, 4:8] = a[4:8, 4:8, 4:8]
+    assert earth_movers_distance(a, a) == chamfer_distance(a, a) == 0.0
+    # A shift that keeps the order of the nodes.
+    assert earth_movers_distance(a, 3.0 * b) == pytest.approx(16 / 32, abs=1e-9)
+    nearest = np.average(20 - np.arange(4, 8), weights=a[4:8].sum((1, 2)))
+    farthest = np.average(np.arange(20, 24) - 7, weights=a[4:8].sum((1, 2)))
+    assert chamfer_distance(a, b) == pytest.approx((nearest + farthest) / 32)
+    # In other proportions: a tenth of the mass has to cross.
+    assert earth_movers_distance(a / a.sum() + b / b.sum(), a / a.sum() * 1.2 + 0.8 * b / b.sum()) == (
+        pytest.approx(0.1 * 16 / 32, rel=0.05)
+    )

@@ -16,7 +16,7 @@ import pytest
 from plab.cli.run import main
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.files import ShapeError
-from plab.objective import spread_mass, target_sdf
+from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.render.graphics import RenderError
 from plab.render.rollouts import stored
 from plab.results import config_dict, load
@@ -239,6 +239,24 @@ def test_points_and_masses_that_do_not_do():
         np.save("it.npy", array)
         with pytest.raises(TargetError, match=named):
             build_target(scene_of(CUBE), {"recipe": recipe, "file": "it.npy"})
+
+
+def test_hollow_points_are_refused_or_filled_and_rounding_counts_as_nothing():
+    rng, (ball, shell) = np.random.default_rng(0), np.empty((2, 20_000, 3))
+    ball[:] = rng.normal(size=ball.shape)
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    shell[:] = 0.5 + 0.15 * ball
+    np.save("shell.npy", shell)
+    np.save("solid.npy", 0.5 + 0.15 * ball * rng.random((len(ball), 1)) ** (1 / 3))
+    scene = scene_of(CUBE)
+    with pytest.raises(TargetError, match="enclose empty space"):
+        build_target(scene, {"recipe": "points", "file": "shell.npy"})
+    filled = build_target(scene, {"recipe": "points", "file": "shell.npy", "fill": True})
+    solid = build_target(scene, {"recipe": "points", "file": "solid.npy"})
+    assert soft_iou(filled, solid) > 0.9 * soft_iou(solid, solid)
+    np.save("mass.npy", solid - 1e-12)
+    rounded = build_target(scene, {"recipe": "mass", "file": "mass.npy"})
+    assert rounded.min() == 0.0 and np.allclose(rounded, solid, atol=1e-6 * solid.max())
 
 
 def test_a_changed_file_is_another_configuration_and_a_moved_one_is_not(tmp_path):

@@ -179,7 +179,8 @@ def test_rows_are_those_of_the_rule_by_the_simulators_gradient(tmp_path: Path, w
     assert np.array_equal(result.best_actions, tried[best])
     assert rows["kept_score"].iloc[-1] == pytest.approx(result.evaluation["score"], abs=1e-9)
     hard = problem.rollout(result.best_actions[None], gradient=False)
-    assert measures(hard) == result.evaluation
+    assert measures(hard).items() <= result.evaluation.items()
+    assert 0.0 < result.evaluation["earth_movers"] < 1.0 and 0.0 <= result.evaluation["chamfer"] < 1.0
     assert np.array_equal(hard.final_mass[0], result.masses["final"])
     # Only adam_h optimises in the model that judges.
     same = result.evaluation["loss"] == pytest.approx(result.best_loss, rel=1e-12)

@@ -18,6 +18,7 @@ import numpy as np
 from plab.config import Config, ConfigError
 from plab.config.families import family
 from plab.errors import PlabError, out_of_memory
+from plab.objective import chamfer_distance, earth_movers_distance
 from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import ResultsError, row_count
 from plab.runners.tracks import RunError, Step, TogetherError, Track, batch_title
@@ -279,7 +280,9 @@ class Runner:
             "final": cast(np.ndarray, episodes.final_mass),
             "target": self.problem.target_mass,
         }
-        judged = measures(episodes, number)
+        pair = masses["final"][number], masses["target"][number]
+        distances = {"chamfer": chamfer_distance(*pair), "earth_movers": earth_movers_distance(*pair)}
+        judged = measures(episodes, number) | distances
         try:
             # After the last row, whose steps are those before it.
             steps = int(track.run.result.columns["steps"][-1]) + track.cfg.sim.horizon

@@ -167,24 +167,35 @@ class RingTarget(PointsRecipe):
 # ------------------------------------------------------------------------------------------------------ files
 
 
+_LARGEST_HOLLOW = 0.02
+"""Share of a solid's cells that its points may leave empty around."""
+
+_POINTS_PER_CELL = 8
+"""Points of a cell of a solid that is filled."""
+
+_NEGATIVE = 1e-3
+"""Share of a mass tensor that rounding may have put below zero."""
+
 _MEASURED = 1000
 """Maximum number of points whose distance to the next one is measured."""
 
 
 @dataclass
 class PointsTarget(PointsRecipe):
-    """A solid that points fill, in domain units; those of a surface alone make a shell.
+    """A solid that points fill, in domain units; those of a closed surface alone are refused, or filled.
 
     Attributes:
         file: NumPy array of shape [point, 3], PLY file, of which the vertices count, or XYZ file. A relative
             one is looked for in the working directory, in the config folder and in the folder above it.
         sha256: SHA-256 of the file. Found out where it is not given; refused if it is another one.
+        fill: Fill the space that the points enclose.
     """
 
     file: str
     sha256: str | None = None
+    fill: bool = False
 
-    def sample(self, scene: Scene, _: np.random.Generator) -> np.ndarray:
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
         # Imported here: SciPy's start-up would be paid by every `--help`.
         from scipy.spatial import KDTree
 
@@ -200,7 +211,30 @@ class PointsTarget(PointsRecipe):
                 f"target: half of the points of {self.file} have no other within {distance:.2g}, more than a "
                 f"cell of the grid, {scene.dx:.2g}: give more points, or a coarser grid"
             )
+        cells, enclosed = _filled(points, scene.grid_size)
+        if self.fill:
+            inside = np.argwhere(cells).repeat(_POINTS_PER_CELL, axis=0)
+            return (inside + rng.random(inside.shape)) / scene.grid_size
+        if enclosed > _LARGEST_HOLLOW:
+            raise TargetError(
+                f"target: the points of {self.file} enclose empty space, {enclosed:.0%} of their solid: give "
+                "points inside it, too, or fill: true"
+            )
         return points
+
+
+def _filled(points: np.ndarray, n: int) -> tuple[np.ndarray, float]:
+    """Return the cells of the solid that points lie in or enclose, bool, shape [n, n, n], and the share of
+    those whose neighbours are as empty as they are."""
+    # Imported here: SciPy's start-up would be paid by every `--help`.
+    from scipy.ndimage import binary_closing, binary_dilation, binary_fill_holes
+
+    cells = np.zeros((n, n, n), bool)
+    cells[tuple((points * n).astype(int).clip(0, n - 1).T)] = True
+    # Between points of a cell's distance are cells without any.
+    closed = binary_closing(np.pad(cells, 2), np.ones((3, 3, 3)))[2:-2, 2:-2, 2:-2] | cells
+    solid = binary_fill_holes(closed)
+    return solid, float((solid & ~binary_dilation(closed)).sum() / solid.sum())
 
 
 @dataclass
@@ -208,8 +242,8 @@ class MassTarget(TensorRecipe):
     """A mass tensor; node (i, j, k) is at (i, j, k) / n.
 
     Attributes:
-        file: NumPy array of shape [n, n, n], n as in ``sim.grid_size``, not negative; found as those of
-            :class:`PointsTarget` are.
+        file: NumPy array of shape [n, n, n], n as in ``sim.grid_size``, not negative but for rounding, which
+            counts as 0; found as those of :class:`PointsTarget` are.
         sha256: SHA-256 of the file, likewise.
     """
 
@@ -259,9 +293,10 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
 def _read_tensor(file: str, _sha256: str) -> np.ndarray:
     """Read a mass tensor, float64, once for each content."""
     mass = _numbers(file, "a mass tensor: give .npy")
-    if not (np.isfinite(mass) & (mass >= 0)).all() or not mass.any():
+    below = -mass.clip(max=0.0).sum()
+    if not np.isfinite(mass).all() or not below <= _NEGATIVE * mass.sum() or not mass.any():
         raise ShapeError(f"{file} must hold masses that are finite, not negative and not all 0")
-    return mass
+    return mass.clip(0.0)
 
 
 def _numbers(file: str, expected: str) -> np.ndarray:
