@@ -97,6 +97,28 @@ def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path)
     assert policy_path(again.path).read_bytes() == policy_path(cfg.path).read_bytes()
 
 
+def test_parameters_are_found_from_observed_particles(tmp_path: Path) -> None:
+    words = ["task=Torus", "variant=1", *COARSE, "observe_particles=30"]
+    assert main([*words, "--output", str(tmp_path)]) == 0
+    fit = ["method=identify", f"method.dataset={tmp_path}/plab/Torus-v0", "task.yield_stress=100"]
+    fit += ["method.parameters=[yield_stress,gravity]", "method.iterations=8", "checkpoint_seconds=0"]
+    cfg, again = (load_config([*words, *fit, f"results_dir={tmp_path}/{name}"]) for name in "ab")
+    run_config(cfg, CACHE)
+    result = read(cfg.path)
+    rows, last = result.iterations, result.iterations.iloc[-1]
+    assert last["yield_stress"] == pytest.approx(50.0, rel=0.1) and last["gravity"] == pytest.approx(
+        30.0, rel=0.1
+    )
+    assert rows["misfit"].is_monotonic_decreasing and last["misfit"] < 0.1 * rows["misfit"][0]
+    assert 0.0 < last["yield_stress_deviation"] < 5.0 and np.isnan(last["youngs_modulus"])
+    with stopped_at(3):
+        run_config(again, CACHE)
+    run_config(again, CACHE)
+    finished_as(again, result)
+    with pytest.raises(ConfigError, match=r"method\.parameters"):
+        load_config([*words, *fit, "method.parameters=[mass]"])
+
+
 def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:
     assert "method=adam" in told(["task=Move", "variant=random", "seed_scene=3", *COARSE], main)
     again = ["task=Move", "variant=1", *COARSE, "--output", str(written)]

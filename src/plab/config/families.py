@@ -121,6 +121,7 @@ FAMILIES: Mapping[str, Family] = _Registry(
     shac="plab.runners.shac:FAMILY",
     bc="plab.runners.bc:FAMILY",
     mpc="plab.runners.mpc:FAMILY",
+    identify="plab.runners.identify:FAMILY",
 )
 """plab's own families by name, the ``family`` of a method's YAML."""
 

@@ -1,0 +1,198 @@
+"""System identification: ``identify`` fits material, friction and gravity to observed particles.
+
+Gauss-Newton with Levenberg's damping on the positions of an episode of a dataset, whose actions are simulated
+with each parameter a little larger and smaller, all in one batch. The standard deviations are those of
+Laplace's approximation, with the noise that the residuals show. The configuration has the first guess. To
+reproduce a result:
+
+    plab dataset task=Torus variant=1
+    plab run task=Torus method=identify task.yield_stress=100 seed=0
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plab.config import ConfigError, MethodConfig, ranges
+from plab.config.families import Appearance, Family
+from plab.runners.runner import Runner, Step, Track, shared_problem
+
+if TYPE_CHECKING:
+    from plab.problem import Episodes
+    from plab.scenes import Scene
+
+PARAMETERS = ("youngs_modulus", "poisson_ratio", "yield_stress", "floor_friction", "gravity")
+"""Parameters that can be fitted; of gravity the acceleration downwards."""
+
+HIGHEST_POISSON_RATIO = 0.49
+
+
+@dataclass
+class IdentifyConfig(MethodConfig):
+    """System identification.
+
+    Attributes:
+        dataset: Folder of a dataset of this task and variant; the observation is ``state`` or ``particles``.
+        episode: Number of its episode that is fitted.
+        parameters: Parameters that are fitted, of :data:`PARAMETERS`; the others are the task's.
+        iterations: Simulations of all parameters' changes, hence steps.
+        difference: Relative change of a parameter for central differences.
+        damping: First damping, relative to the curvature.
+    """
+
+    dataset: str
+    episode: int = field(metadata=ranges.NOT_NEGATIVE)
+    parameters: list[str]
+    iterations: int = field(metadata=ranges.COUNT)
+    difference: float = field(metadata=ranges.POSITIVE)
+    damping: float = field(metadata=ranges.FINITE)
+
+    def check(self, path: str) -> None:
+        super().check(path)
+        if not self.parameters or len(set(self.parameters)) < len(self.parameters):
+            raise ConfigError(f"{path}.parameters must name each parameter once (got {self.parameters})")
+        for name in self.parameters:
+            ranges.one_of(f"{path}.parameters", name, PARAMETERS)
+
+
+class IdentifyRunner(Runner):
+    """Fits parameters; each iteration is a batch of simulations, and a step if the last one was good.
+
+    A row has the best parameters so far, their standard deviations, and the root mean square distance of the
+    particles from where they were observed. Actions and scores are those of the episode.
+    """
+
+    def build(self) -> None:
+        """Read the episode, and make an environment per change of a parameter."""
+        from plab.demonstrations.minari import read_episodes
+
+        (track,) = self.tracks
+        self._method = method = track.cfg.method_as(IdentifyConfig)
+        self.problem = shared_problem(self.cache, [track.cfg] * (2 * len(method.parameters) + 1))
+        scene, episodes = self.problem.scenes[0], list(read_episodes(method.dataset, method.episode + 1))
+        if method.episode >= len(episodes):
+            raise ConfigError(
+                f"method.episode={method.episode}: {method.dataset} has {len(episodes)} episodes"
+            )
+        self._actions, seen = episodes[-1].actions.astype(np.float64), episodes[-1].observations
+        if isinstance(seen, dict):
+            seen = seen["particles"] if "particles" in seen else seen.get("state", np.empty((0, 0)))
+        least = track.cfg.observe_particles if seen.ndim == 2 else scene.particle_count
+        self._stride = max(scene.particle_count // least, 1)
+        count = len(range(0, scene.particle_count, self._stride))
+        if (
+            self._actions.shape != (scene.horizon, scene.action_dim)
+            or seen.reshape(len(seen), -1).shape[1] < 3 * count
+        ):
+            raise ConfigError(
+                f"method.dataset={method.dataset} is of another scene or observation: use its task, sim and "
+                "observe_particles"
+            )
+        rows = seen if seen.ndim == 3 else seen[:, : 6 * count].reshape(len(seen), count, 6)
+        self._observed = rows[1:, :, :3].astype(np.float64)
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Begin with the configuration's parameters, or go on from the file's."""
+        first = [_value(self.problem.scenes[0], name) for name in self._method.parameters]
+        if min(first) <= 0.0:
+            raise ConfigError("parameters that are fitted must be positive at first")
+        logs = np.log(first)
+        nothing = np.zeros((len(logs), len(logs))), np.zeros(len(logs))
+        begin = {"trial": logs, "best": logs, "cost": np.inf, "damping": self._method.damping}
+        self._state: dict[str, Any] = begin | dict(zip(("curvature", "slope"), nothing, strict=True))
+        if state is not None:
+            self._state = {name: np.array(value) for name, value in state.items()}
+
+    def step(self, track: Track) -> Step:
+        """Simulate the trial and its changes, take it if it fits better, and make the next one."""
+        begin, method, state = time.perf_counter(), self._method, self._state
+        changes = np.eye(len(method.parameters)) * method.difference
+        trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
+        positions, measured = self._simulate(np.exp(trials))
+        residual = (positions[0] - self._observed).ravel()
+        cost = float(residual @ residual)
+        if cost < state["cost"]:
+            up, down = np.split(positions[1:].reshape(2 * len(changes), -1), 2)
+            slopes = (up - down) / (2.0 * method.difference)
+            linear = {"curvature": slopes @ slopes.T, "slope": slopes @ residual}
+            state |= {"best": state["trial"], "cost": cost, "damping": state["damping"] / 3.0} | linear
+        else:
+            state |= {"damping": max(4.0 * state["damping"], 1e-6)}
+        damped = state["curvature"] + state["damping"] * np.diag(np.diag(state["curvature"]))
+        way = np.linalg.lstsq(damped, -state["slope"], rcond=None)[0]
+        # No parameter changes by more than a factor of 2 at once.
+        state["trial"] = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
+        variance = state["cost"] / max(residual.size - len(changes), 1)
+        deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
+        found = dict.fromkeys(FAMILY.columns, np.nan)
+        found["misfit"] = float(np.sqrt(3.0 * state["cost"] / residual.size))
+        for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
+            found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
+        seconds, steps = time.perf_counter() - begin, len(self._actions) * len(trials)
+        return Step(measured | found, self._actions, dict(state), steps_forward=steps, seconds=seconds)
+
+    def close(self) -> None:
+        """Return to the configuration's scene."""
+        if hasattr(self, "problem"):
+            self.problem.simulator.set_scenes(self.problem.scenes)
+
+    def judge(self, actions: np.ndarray) -> Episodes:
+        """Run the actions in the configuration's scene."""
+        return super().judge(np.concatenate([actions] * self.problem.simulator.batch))
+
+    def tell(self, rows: Any, tracks: Any) -> None:
+        """Report the fit."""
+        texts = [f"{n} {rows[0][n]:.4g} ± {rows[0][f'{n}_deviation']:.2g}" for n in self._method.parameters]
+        self.report(self.tracks[0].iteration, f"misfit {rows[0]['misfit']:.3g}, {', '.join(texts)}")
+
+    def _simulate(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
+        """Return positions after each step, shape [environment, T, particle, 3], with parameters of shape
+        [environment, parameter], and the measures of the first episode."""
+        problem, simulator = self.problem, self.problem.simulator
+        scene = problem.scenes[0]
+        simulator.set_scenes([_changed(scene, self._method.parameters, own) for own in values])
+        simulator.set_contact("hard")
+        first, terms, positions = problem.loss_of(simulator.measure().terms)[0], [], []
+        for action in self._actions:
+            simulator.step(np.stack([action] * simulator.batch))
+            positions.append(np.asarray(simulator.observe(self._stride))[..., :3])
+            terms.append(simulator.measure().terms[0])
+        loss, iou = problem.loss_of(np.array(terms)), simulator.measure().iou
+        sums = zip(problem.term_names, np.array(terms).sum(axis=0).tolist(), strict=True)
+        measured = {
+            "loss": float(loss.sum()),
+            **{f"loss_{name}": total for name, total in sums},
+            "reward": float((first - loss).sum()),
+            "iou": float(iou[0]),
+            "score": float(problem.scores_of(iou)[0][0]),
+        }
+        return np.stack(positions, axis=1).astype(np.float64), measured
+
+
+def _value(scene: Scene, name: str) -> float:
+    return -scene.gravity[1] if name == "gravity" else getattr(scene, name)
+
+
+def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
+    changes: dict[str, Any] = dict(zip(names, values.tolist(), strict=True))
+    if "gravity" in changes:
+        changes["gravity"] = (scene.gravity[0], -changes["gravity"], scene.gravity[2])
+    if "poisson_ratio" in changes:
+        changes["poisson_ratio"] = min(changes["poisson_ratio"], HIGHEST_POISSON_RATIO)
+    return replace(scene, **changes)
+
+
+FAMILY = Family(
+    label="parameters of a scene, fitted to observed particles",
+    config=IdentifyConfig,
+    runner=IdentifyRunner,
+    columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
+    may_be_nan=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
+    contact="hard",
+    methods={"identify": Appearance("Identify", "#555555", ":")},
+)
