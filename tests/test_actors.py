@@ -17,7 +17,7 @@ from plab.runners import run_config
 from plab.runners.actors import DEVIATION_MIN, training_scenes
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.shac import ShacTraining, td_lambda
+from plab.runners.shac import td_lambda
 from plab.runners.training import shared_batches
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
@@ -136,17 +136,6 @@ def test_an_evaluation_that_breaks_off_ends_nothing(
     assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
     (told,) = (record.getMessage() for record in caplog.records)
     assert "iteration 1" in told
-
-
-def test_a_state_of_other_networks_is_refused() -> None:
-    def training(hidden: int) -> ShacTraining:
-        cfg = make_config("results", "shac", f"method.hidden=[{hidden}]")
-        return ShacTraining([cfg], environments(cfg)[0])
-
-    (state,) = training(8).states()
-    training(8).restore(0, state)
-    with pytest.raises(RuntimeError, match=r"mu.0.weight"):
-        training(9).restore(0, state)
 
 
 def test_targets_look_ahead_as_far_as_lambda_says() -> None:

@@ -57,14 +57,6 @@ def test_recorded_scores_are_complete_and_prove_that_scripted_targets_can_be_rea
     assert ((table["score"] > 0) & (table["score"] <= 1)).all()
 
 
-def test_random_variants_and_others_than_the_suites():
-    assert load_actions("Rope", "6") is load_actions("NoSuchTask", "1") is None
-    drawn = known_actions(load_config(["task=Torus", "variant=random", "seed_scene=3"]))
-    assert drawn.shape == (50, 3)
-    assert not any(np.array_equal(drawn, load_actions("Torus", v)) for v in VARIANTS)
-    assert known_actions(load_config(["task=Rope", "variant=random", "seed_scene=3"])) is None
-
-
 @pytest.fixture
 def records(tmp_path, monkeypatch):
     """A copy of the records that may be changed."""

@@ -56,11 +56,6 @@ PLAB = [
 ]
 
 
-def test_commands_and_code_are_found():
-    assert len(PLAB) > 60 and len(PYTHON) > 20
-    assert {command.split()[1] for command in PLAB} > {"run", "report", "bench"}
-
-
 @functools.cache
 def compose(words: tuple[str, ...], config_dir: str | None = None) -> None:
     load_config(words, config_dir)

@@ -374,19 +374,6 @@ def test_a_batch_gives_each_run_what_it_gives_alone(finished, others, halved, tm
         assert (got.provenance["batch"], want.provenance["batch"]) == (2, 1)
 
 
-def test_a_batch_goes_on_where_each_of_its_runs_stands(
-    finished, others, halved, tmp_path: Path, monkeypatch
-) -> None:
-    first, other = (make_config(tmp_path, "solve", "checkpoint_seconds=0", *words) for words in ((), OTHER))
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="gone"):
-        stop_before(patch, 3)
-        run_config(first, CACHE)
-    # One is in its second stage, the other in its first.
-    run_batch([first, other], cache=CACHE)
-    assert_same_numbers(read(first.path), finished["solve"])
-    assert_same_numbers(read(other.path), others["solve"])
-
-
 def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, monkeypatch) -> None:
     scores = [results["cem"].iterations["score"].tolist() for results in (finished, others)]
 
@@ -432,34 +419,6 @@ def test_contact_starts_reach_the_body(task: str) -> None:
             nearest.append([reference.signed_distance(m, p, particles)[0].min() for m, p in moving])
         # A tool's way ends at the body's surface, which the particles leave uneven.
         assert np.min(nearest, axis=0).max() < 0.03
-
-
-def solid(target: np.ndarray, center: np.ndarray, half: float, mass: float) -> None:
-    """Spread a mass over the nodes of a cube."""
-    low, high = np.ceil((center - half) * 64).astype(int), np.floor((center + half) * 64).astype(int) + 1
-    target[low[0] : high[0], low[1] : high[1], low[2] : high[2]] += mass / np.prod(high - low)
-
-
-def carried(task: str, variant: str, target: np.ndarray, scale: float) -> np.ndarray:
-    """Ways of two spheres that hold a body between them, in the mean: what they press cancels; [body, 3]."""
-    scene = build_scene(load_config([f"task={task}", f"variant={variant}"]))
-    carry = ContactStarts(scene, target).draw(2, seed=0)[1]
-    return carry.reshape(len(carry), -1, 2, 3).sum(axis=0).mean(axis=1) * scale
-
-
-@pytest.mark.parametrize("variant", "15")
-def test_each_body_is_carried_whole_to_a_place_of_its_own(variant: str) -> None:
-    """On TripleMove some ways of points are shortest from two boxes to one place."""
-    cfg = load_config(["task=TripleMove", f"variant={variant}"])
-    target = np.zeros((64, 64, 64))
-    goals = np.array([body["center"] for body in cfg.task.target["bodies"].values()])
-    for goal in goals:
-        solid(target, goal, 0.05, 1.0)
-    reached = np.array([body.center for body in build_scene(cfg).bodies])
-    reached += carried("TripleMove", variant, target, 0.01)
-    chosen = np.linalg.norm(reached[:, None] - goals[None], axis=2).argmin(axis=1)
-    assert sorted(chosen) == [0, 1, 2]
-    np.testing.assert_allclose(reached, goals[chosen], atol=0.015)
 
 
 def test_candidates_start_at_the_body_as_often_as_asked_for() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from plab.runners.policy import CLIP, Spaces, first_policy, torch_settings
 from plab.runners.replay import ReplayBuffer, Sizes
 from plab.runners.rl import agents_of
 from plab.runners.sb3 import off_policy
-from plab.sweep.plan import plan
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
 
@@ -317,25 +315,3 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
 
 
 # --------------------------------------------------------------------------------------------- who joins
-
-
-def test_runs_that_learn_alike_make_a_population() -> None:
-    words = ["task=Move", "method=sac"]
-    cfgs = [replace(load_config([*words, f"variant={v}"]), seed=s) for v in (1, 2) for s in (0, 1)]
-    cfgs += [load_config([*words, "task.yield_stress=20"])]
-    other = [load_config([*words, "method.tau=0.1"]), load_config(["task=Move", "method=td3"])]
-
-    def sizes(*arguments: Any, **options: Any) -> list[int]:
-        return [len(batch) for batch in plan(*arguments, **options)]
-
-    assert (sizes(cfgs), sizes(cfgs, 3), sizes(cfgs + other, 50)) == ([5], [2, 3], [5, 1, 1])
-    # Each of several processes is to have a part, if there are runs enough.
-    assert sizes(cfgs + other, 50, processes=8) == [1, 2, 2, 1, 1]
-
-
-def test_a_population_fits_half_of_the_device(monkeypatch) -> None:
-    """An environment of Move takes 14 MB on CUDA; the budget of gradients does not count."""
-    one = load_config(["task=Move", "method=ppo", "sim.device=cuda", "method.num_envs=16", "sim.memory_mb=1"])
-    for gigabytes, batches in ((80, [9]), (3, [4, 5]), (0.1, [1] * 9), (math.inf, [9])):
-        monkeypatch.setattr("plab.sim.memory.device_bytes", lambda device, have=gigabytes: have * 1e9)
-        assert [len(batch) for batch in plan([replace(one, seed=s) for s in range(9)])] == batches

@@ -221,29 +221,6 @@ def test_what_is_hidden_is_plasticine_behind_a_manipulator_and_near_it(height, e
     assert share > 0.5 if hides else share == 0.0
 
 
-def test_plasticine_is_seen_through_manipulators_and_ghosts_through_plasticine():
-    def pixel(world, place, view, mass=None, shift=0.0):
-        """Colour in which a point of a scene is seen, whose particles are shifted along x."""
-        x = sample_particles(world)
-        camera = fit_camera(x, view, SIZE[0] / SIZE[1])
-        column, row = np.floor(camera.project(np.array(place), SIZE)).astype(int)
-        with closing(Renderer(world, mass, SIZE, camera)) as renderer:
-            return renderer.frame(x + np.array([shift, 0.0, 0.0]), start_poses(world))[row, column].astype(
-                int
-            )
-
-    pressing = scene(dataclasses.replace(SPHERE, position=(0.4, 0.22, 0.5)))
-    assert is_metal(pixel(pressing, (0.4, 0.22, 0.5), View(0.0, 60.0), shift=-0.25))
-    pressed = pixel(pressing, (0.4, 0.22, 0.5), View(0.0, 60.0))
-    assert pressed[0] > pressed[2] + 30
-
-    unit = np.random.default_rng(1).random((800, 3)) - 0.5
-    inside = spread_mass(CUBE.center + 0.05 * unit, 32, 1e-4)
-    plain, ghost = (pixel(scene(), CUBE.center, View(30.0, 30.0), mass) for mass in (None, inside))
-    assert is_clay(plain)
-    assert ghost[0] < plain[0] - 15 and ghost[2] > plain[2] + 15
-
-
 # ------------------------------------------------------------------------------------------------------ files
 
 

@@ -50,16 +50,6 @@ def test_values_below_zero_count_as_zero_run_by_run() -> None:
     assert band([runs[0], later], "episodes", "reward") is None
 
 
-def test_axes_of_a_run(tmp_path: Path) -> None:
-    result = synthetic.run(tmp_path)
-    synthetic.save(result)
-    ((names, table),) = load_series(collect(tmp_path, select([], NAMES)))
-    assert names == {"task": "Rope", "variant": "1", "method": "adam", "seed": "0"}
-    assert table["episodes"].tolist() == [1, 2, 3, 4]
-    assert table["substeps"].tolist() == [950, 1900, 2850, 3800]
-    np.testing.assert_allclose(table["seconds"], np.cumsum(result.iterations["seconds"]))
-
-
 # ---------------------------------------------------------------------------------------------------- budgets
 
 

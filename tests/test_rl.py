@@ -20,7 +20,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from plab.config import Config, load_config
 from plab.config.families import FAMILIES
 from plab.envs.core import EpisodeBatch
-from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.objective import scores
 from plab.results import ResultsError, RunFile, RunResult, read
@@ -324,21 +323,6 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
 
 
 # ---------------------------------------------------------------- failures
-
-
-def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, monkeypatch, caplog) -> None:
-    intact, calls = PlabVecEnv.step_wait, itertools.count()
-
-    def step_wait(self: PlabVecEnv) -> Any:
-        if next(calls) == 9:
-            make_not_finite(self.batch.problem.simulator, 1)
-        return intact(self)
-
-    monkeypatch.setattr(PlabVecEnv, "step_wait", step_wait)
-    result = run(make_config(tmp_path, "tqc"))
-    assert result.provenance["broken_episodes"] == 1
-    assert np.isfinite(result.iterations[1:].to_numpy()).all()
-    assert len(caplog.records) == 1
 
 
 def break_evaluation(monkeypatch: pytest.MonkeyPatch, number: int) -> None:

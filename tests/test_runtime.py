@@ -63,16 +63,3 @@ def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
     del former, own
     gc.collect()
     assert freed == [kept]
-
-
-@pytest.mark.nightly
-def test_a_simulator_that_is_there_at_the_end_says_nothing() -> None:
-    script = """
-from plab.bench import workload
-from plab.config import load_config
-words = ["task=Move", "sim.grid_size=32", "sim.substeps=10", "sim.dt=2e-4", "sim.particles_scale=0.05"]
-load = workload.build(load_config(words), 1, 1)
-load.simulator.rollout(load.actions, True)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stderr == ""

@@ -130,21 +130,6 @@ def test_other_scenes_in_the_same_simulator_are_as_if_built_anew(sim: Simulator)
         sim.set_scenes([replace(s, substeps=6) for s in SCENES])
 
 
-def test_environments_may_have_contact_models_of_their_own(sim: Simulator) -> None:
-    settings = (("soft", 666.0), ("hard", 666.0), ("soft", 200.0))
-    want = []
-    for model, softness in settings:
-        sim.set_contact(model, softness)
-        want.append(sim.rollout(ACTIONS))
-    sim.set_contact(*zip(*settings, strict=True))
-    got = sim.rollout(ACTIONS)
-    for e, alone in enumerate(want):
-        assert_same(got.gradient[e], alone.gradient[e])
-        assert_same(got.step_terms[e], alone.step_terms[e])
-    assert not np.array_equal(want[0].gradient, want[1].gradient)
-    assert not np.array_equal(want[0].gradient, want[2].gradient)
-
-
 def test_states_in_several_arrays_give_the_same_gradient(
     sim: Simulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

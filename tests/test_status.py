@@ -60,15 +60,6 @@ def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder
     assert counts(find(folder, "task=Rope", "sim.particles_scale=0.5"))["done"] == 0
 
 
-def test_empty_folder_expects_the_papers_methods_and_three_seeds(tmp_path: Path, capsys) -> None:
-    found = find(tmp_path, missing=True)
-    assert counts(found)["missing"] == len(found.runs) == 10 * 5 * 6 * 3
-    assert counts(find(tmp_path, "task=Rope", "method=adam"))["missing"] == 5 * 3
-    synthetic.save(synthetic.run(tmp_path))
-    assert main([str(tmp_path), "--missing"]) == 0
-    assert capsys.readouterr().out.endswith("50 runs: 1 done, 49 missing\n")
-
-
 # --------------------------------------------------------------------------------------------- runs under way
 
 

@@ -19,7 +19,6 @@ import yaml
 
 import plab
 import synthetic
-from browsing import browsing, press
 from plab.cli.submissions import leaderboard, submit, verify
 from plab.config import load_config
 from plab.config.suite import suite_tasks
@@ -406,22 +405,3 @@ def test_the_page_shows_it_and_takes_no_text_for_html(folder: Path, tmp_path: Pa
     assert '<a href="https://example.org/mine" rel="nofollow noopener">plans</a>' in text
     assert "do not hold; why" in text and text.count("<section>") == 5
     assert not re.findall(r'(?:src|href)="(?!https?://)', text)
-
-
-@pytest.mark.nightly
-@browsing
-def test_the_page_filters_and_sorts(browser, folder: Path, tmp_path: Path) -> None:
-    assert leaderboard([str(folder), "--out", str(tmp_path)]) == 0
-    browser.get((tmp_path / "index.html").as_uri())
-    rows = "[...document.querySelector('.board').tBodies[0].rows].filter((row) => !row.hidden)"
-    names = f"return {rows}.map((row) => row.cells[0].innerText.split('\\n')[0])"
-    assert browser.execute_script(names) == ["Adam", "GD", "Adam-H", "plans", "policy"]
-    for button, shown in (
-        ("[data-filter=track] button[value=policies]", ["policy"]),
-        ("[data-filter=track] button[value='']", ["Adam", "GD", "Adam-H", "plans", "policy"]),
-        ("[data-filter=gradient] button[value=yes]", ["Adam", "GD", "Adam-H", "plans"]),
-        (".board th button", ["Adam", "Adam-H", "GD", "plans"]),
-    ):
-        press(browser, button)
-        assert browser.execute_script(names) == shown
-    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
-from plab.envs import autograd
 from plab.envs.autograd import policy_gradient
 from plab.objective import scores
 from plab.problem import Problem
@@ -75,13 +74,6 @@ def method() -> MethodConfig:
 
 def rule(method: MethodConfig, steps: int, size: int, seed: int = 0) -> UpdateRule:
     return FAMILIES["trajectory"].rules[method.optimizer].what(method, (steps, size), seed)
-
-
-@pytest.mark.parametrize("seed", [0, 7, 2**32 + 5])
-def test_first_actions_are_drawn_as_torch_draws(method, seed: int) -> None:
-    unit = torch.rand((50, 6), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).numpy()
-    drawn = rule(method, 50, 6, seed).actions
-    assert np.array_equal(drawn, (2.0 * unit - 1.0) * method.action_init)
 
 
 def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
@@ -374,13 +366,3 @@ def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_pa
     assert trained.best_loss == rows["loss"].min()
     judged = scores(trained.masses["initial"], trained.masses["final"], trained.masses["target"])
     assert trained.evaluation["score"] == judged.score
-
-
-def test_apg_resumes_to_the_same_numbers(tmp_path: Path, trained: RunResult, monkeypatch) -> None:
-    cfg = make_config(tmp_path, *APG)
-    with stopped_at(2, autograd, "policy_gradient"):
-        run_config(cfg, CACHE)
-    assert len(read(cfg.path.with_suffix(".partial.h5")).iterations) == 2
-    again = run(cfg)
-    assert_same_numbers(again, trained)
-    assert again.provenance["resumed"] == 1

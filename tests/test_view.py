@@ -125,17 +125,6 @@ def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
     assert "</title><b>" not in strange and "&lt;/title&gt;&lt;b&gt;, variant 1" in strange
 
 
-def test_frames_and_particles_are_thinned_out(recording, monkeypatch):
-    x, poses = (np.repeat(array[:1], 151, axis=0) for array in (recording.x, recording.poses))
-    long = dataclasses.replace(recording, x=x, poses=poses, scores=np.zeros(151))
-    for every, steps in ((None, [*range(0, 151, 3)]), (100, [0, 100, 150])):
-        (rope,) = things(viewer.page(long, every))["plasticine"]
-        assert list(frames(rope["positions"])) == steps
-    monkeypatch.setattr(viewer, "_POSITIONS", 2 * recording.scene.particle_count)
-    (rope,) = things(viewer.page(recording))["plasticine"]
-    assert frames(rope["positions"])[3].reshape(-1, 3) == pytest.approx(recording.x[3, ::2], abs=0.51 / 2**16)
-
-
 # ------------------------------------------------------------------------------- command line and notebook
 
 

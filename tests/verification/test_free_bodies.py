@@ -36,9 +36,6 @@ MATERIALS = {
 }
 """Environments in free space."""
 
-TILTS = (0.5, 0.9, 1.1, 1.5)
-"""Slopes of the ground, in units of the floor's friction."""
-
 BAR_LENGTH = 0.5
 BAR_COUNTS = (4, EDGE)
 """Particles across the bar: its vibration is one-dimensional, its section need not be resolved."""
@@ -75,8 +72,6 @@ def scenes() -> dict[str, Scene]:
     out["falling"] = block(gravity=(3.0, -30.0, 7.0))
     on_floor = np.array([0.5, 0.5 * WIDTH, 0.5])
     ground = {"yield_stress": np.inf, "poisson_ratio": 0.0, "floor_friction": FLOOR_FRICTION}
-    for tilt in TILTS:
-        out[f"slope {tilt}"] = block(on_floor, gravity=(30.0 * FLOOR_FRICTION * tilt, -30.0, 0.0), **ground)
     for name, friction in (("slippery", 0.0), ("rough", FLOOR_FRICTION), ("sticky", 100.0)):
         out[name] = block(on_floor, **{**ground, "floor_friction": friction, "gravity": (0.0, -30.0, 0.0)})
     out["bar"] = bar(GRID)[0]
@@ -307,21 +302,6 @@ def test_cyclic_stretch_draws_the_elastoplastic_loop(free: Simulator) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------ floor
-
-
-def test_a_block_sticks_below_the_friction_threshold_and_slides_above(free: Simulator) -> None:
-    """a = g_x - k g_y above the threshold, between two times after vibrations have died out."""
-    put(free, at_rest())
-    early = momentum(advance(free, 500)) / TOTAL
-    late = momentum(advance(free, 500)) / TOTAL
-    for tilt in TILTS:
-        e, gravity = NAMES.index(f"slope {tilt}"), SCENES[f"slope {tilt}"].gravity
-        if tilt < 1.0:
-            np.testing.assert_allclose(late[e], 0.0, atol=1e-4)
-        else:
-            want = gravity[0] + FLOOR_FRICTION * gravity[1]
-            got = (late[e] - early[e]) / (500 * DT)
-            np.testing.assert_allclose(got, [want, 0.0, 0.0], atol=0.01 * want)
 
 
 def test_a_sliding_block_loses_friction_times_the_normal_impulse(free: Simulator) -> None:
