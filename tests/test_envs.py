@@ -80,7 +80,6 @@ def random_actions(steps: int = HORIZON, seed: int = 0) -> np.ndarray:
 def test_ids_are_those_of_the_conf_folder() -> None:
     files = [conf_folder() / "task" / f"{task}.yaml" for task in choices("task")]
     expected = {f"plab/{path.stem}-v{v}" for path in files for v in OmegaConf.load(path).variants}
-    assert len(expected) == 50
     assert {env_id for env_id in gymnasium.registry if env_id.startswith("plab/")} == expected
 
 

@@ -32,7 +32,8 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         space = env.observation_space
         if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):
             raise ArgumentError('observe must hold "state", "mass" and "target_mass"')
-        self.observation_space = Dict({name: space.spaces[own] for name, own in _NAMES.items()})
+        goals: Any = Dict({name: space.spaces[own] for name, own in _NAMES.items()})
+        self.observation_space = goals
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Return minus the share of the mass that is in the wrong cell, for one goal or many.
