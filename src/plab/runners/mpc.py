@@ -212,8 +212,8 @@ class MpcRunner(PlannerRunner):
     def _here(self) -> State:
         """Return the state of the first environment, for all of them."""
         state = self.problem.simulator.state()
-        shared = {name: np.repeat(own[:1], len(own), axis=0) for name, own in vars(state).items()}
-        return replace(state, **shared)
+        arrays = {name: own for name, own in vars(state).items() if own is not None}
+        return replace(state, **{name: np.repeat(own[:1], len(own), axis=0) for name, own in arrays.items()})
 
     def _go_to(self, state: State) -> None:
         self.problem.simulator.set_initial_state(state)
