@@ -307,12 +307,12 @@ class TilePhases(ParticlePhases):
     ):
         """A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry ``at``;
         the new F is stored if ``update``."""
-        for number, law in ti.static(enumerate(self.laws)):
+        for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(law.name)):
-                    self.scheduled_tile(state, state_at, source, target, entry9, e, at, law, number, update)
+                if ti.static(self.scheduled(number)):
+                    self.scheduled_tile(state, state_at, source, target, entry9, e, at, number, update)
                 else:
-                    self.law_tile(state_at, source, target, entry9, e, at, law, number, update)
+                    self.law_tile(state_at, source, target, entry9, e, at, number, update)
 
     @ti.func
     def law_tile(
@@ -323,35 +323,32 @@ class TilePhases(ParticlePhases):
         entry9,
         e,
         at,
-        law: ti.template(),
         number: ti.template(),
         update: ti.template(),
     ):
-        self.put_parameters(e, entry9, at, LAW_PARAMETERS, law.size)
+        self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
         first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
         affine = self.lane_in(self.affine, entry9, 0)
         numbers = [number, self.dt, self.stress_scale, self.mass]
         if ti.static(update):
             self.call(
-                law,
+                number,
                 "update",
                 [first, x, affine, self.lane_of(state_at, target, 0)],
                 [],
                 numbers,
             )
         else:
-            self.call(law, "stress_only", [first, x, affine], [], numbers)
+            self.call(number, "stress_only", [first, x, affine], [], numbers)
 
     @ti.func
-    def strain_tile(
-        self, state_at, source, e, entry9, at, law: ti.template(), number: ti.template(), kind: ti.template()
-    ):
+    def strain_tile(self, state_at, source, e, entry9, at, number: ti.template(), kind: ti.template()):
         """Strain of a tile, and its parameters, into ``strains``, in a ``whole_strain`` with what the adjoint
         needs; whether the series serve all its lanes."""
         self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
         addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
         limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return self.ask(law, kind, addresses, [], limits) > 0.0
+        return self.ask(number, kind, addresses, [], limits) > 0.0
 
     @ti.func
     def scheduled_tile(
@@ -363,22 +360,21 @@ class TilePhases(ParticlePhases):
         entry9,
         e,
         at,
-        law: ti.template(),
         number: ti.template(),
         update: ti.template(),
     ):
         """:meth:`law_tile` by parts, of which the new F comes last."""
-        if self.strain_tile(state_at, source, e, entry9, at, law, number, "strain"):
+        if self.strain_tile(state_at, source, e, entry9, at, number, "strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine = self.lane_in(self.affine, entry9, 0)
             numbers = [number, self.stress_scale, self.mass]
-            rigid = self.ask(law, "stress", [first, x, affine], [], numbers)
+            rigid = self.ask(number, "stress", [first, x, affine], [], numbers)
             if ti.static(update):
                 addresses = [first, self.lane_of(state_at, target, 0)]
                 if rigid < 1.0:
-                    self.call(law, "flow", addresses, [], [number])
+                    self.call(number, "flow", addresses, [], [number])
                 else:
-                    self.call(law, "rest", addresses, [], [number])
+                    self.call(number, "rest", addresses, [], [number])
         else:
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):
@@ -400,26 +396,24 @@ class TilePhases(ParticlePhases):
         self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
     ):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
-        for number, law in ti.static(enumerate(self.laws)):
+        for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(law.name)):
+                if ti.static(self.scheduled(number)):
                     self.scheduled_tile_adjoint(
-                        state, state_at, source, bar, bar_at, target, entry9, e, at, law, number
+                        state, state_at, source, bar, bar_at, target, entry9, e, at, number
                     )
                 else:
-                    self.law_tile_adjoint(state_at, source, bar_at, target, entry9, e, at, law, number)
+                    self.law_tile_adjoint(state_at, source, bar_at, target, entry9, e, at, number)
 
     @ti.func
-    def law_tile_adjoint(
-        self, state_at, source, bar_at, target, entry9, e, at, law: ti.template(), number: ti.template()
-    ):
-        self.put_parameters(e, entry9, at, LAW_PARAMETERS, law.size)
+    def law_tile_adjoint(self, state_at, source, bar_at, target, entry9, e, at, number: ti.template()):
+        self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
         first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
         addresses = [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)]
         numbers = [number, self.dt, self.stress_scale, self.mass]
-        self.call(law, "adjoint", addresses, [], numbers)
+        self.call(number, "adjoint", addresses, [], numbers)
         if ti.static(self.full_gradient):
-            self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, law.size, number)
+            self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, self.laws[number].size, number)
 
     @ti.func
     def scheduled_tile_adjoint(
@@ -433,23 +427,22 @@ class TilePhases(ParticlePhases):
         entry9,
         e,
         at,
-        law: ti.template(),
         number: ti.template(),
     ):
-        if self.strain_tile(state_at, source, e, entry9, at, law, number, "whole_strain"):
+        if self.strain_tile(state_at, source, e, entry9, at, number, "whole_strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
             numbers = [number, self.stress_scale]
-            rigid = self.ask(law, "stress_adjoint", [first, affine], [], numbers)
+            rigid = self.ask(number, "stress_adjoint", [first, affine], [], numbers)
             if rigid < 1.0:
-                self.call(law, "flow_adjoint", [first, bars], [], [number])
+                self.call(number, "flow_adjoint", [first, bars], [], [number])
             else:
-                self.call(law, "rest_adjoint", [first, bars], [], [number])
+                self.call(number, "rest_adjoint", [first, bars], [], [number])
             if ti.static(self.full_gradient):
                 self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
             ends = [number, self.dt, self.mass]
             addresses = [first, x, affine, bars]
-            self.call(law, "strain_adjoint", addresses, [], ends)
+            self.call(number, "strain_adjoint", addresses, [], ends)
         else:
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):

@@ -195,12 +195,12 @@ class CudaPhases(OrderPhases, PosePhases):
         """Material update of one particle, whose new F is stored if ``update``; returns A, row by row."""
         out = ti.Vector.zero(self.real, 9)
         p = self.parameters_of_particle(e, source, lane)
-        for number, law in ti.static(enumerate(self.laws)):
+        for number in ti.static(range(len(self.laws))):
             if ti.static(len(self.laws) == 1):
-                out = self.law_particle(state, source, target, lane, e, p, law, update)
+                out = self.law_particle(state, source, target, lane, e, p, number, update)
             else:
                 if p[self.coefficients] == ti.cast(number, self.real):
-                    out = self.law_particle(state, source, target, lane, e, p, law, update)
+                    out = self.law_particle(state, source, target, lane, e, p, number, update)
         return out
 
     @ti.func
@@ -212,17 +212,17 @@ class CudaPhases(OrderPhases, PosePhases):
         lane,
         e,
         p: ti.template(),
-        law: ti.template(),
+        number: ti.template(),
         update: ti.template(),
     ):
         out = ti.Vector.zero(self.real, 9)
         a = variables(self.real, self.load(state, source + AT_C, lane, 9))
         f_new = variables(self.real, self.load(state, source + AT_F, lane, 9))
-        coefficients = variables(self.real, [p[i] for i in range(law.size)])
+        coefficients = variables(self.real, [p[i] for i in range(self.laws[number].size)])
         constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
-        function = ti.static(self.function(law, "particle"))
+        function = ti.static(self.function(number, "particle"))
         served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(law.name)):
+        if ti.static(self.scheduled(number)):
             ends = variables(self.real, ti.static(self.range_of_series()))
             function(*a, *f_new, *coefficients, *constants, *ends, served)
         else:
@@ -233,7 +233,7 @@ class CudaPhases(OrderPhases, PosePhases):
                 if ti.static(update):
                     state[target + AT_F + i][lane] = f_new[i]
         else:
-            if ti.static(self.scheduled(law.name)):
+            if ti.static(self.scheduled(number)):
                 out = self.spectral_material(state, source, target, lane, e, update)
         return out
 
@@ -247,12 +247,12 @@ class CudaPhases(OrderPhases, PosePhases):
     ):
         """Adjoint of :meth:`material_particle`, given that of A."""
         p = self.parameters_of_particle(e, source, lane)
-        for number, law in ti.static(enumerate(self.laws)):
+        for number in ti.static(range(len(self.laws))):
             if ti.static(len(self.laws) == 1):
-                self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, law)
+                self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, number)
             else:
                 if p[self.coefficients] == ti.cast(number, self.real):
-                    self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, law)
+                    self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, number)
 
     @ti.func
     def law_particle_adjoint(
@@ -265,16 +265,16 @@ class CudaPhases(OrderPhases, PosePhases):
         lane,
         e,
         p: ti.template(),
-        law: ti.template(),
+        number: ti.template(),
     ):
         c_out = variables(self.real, self.load(state, source + AT_C, lane, 9))
         f_out = variables(self.real, self.load(state, source + AT_F, lane, 9))
         a, b = variables(self.real, a_bar), variables(self.real, self.load(bar, target + AT_F, lane, 9))
-        p_bar = variables(self.real, [p[i] for i in range(law.size)])
+        p_bar = variables(self.real, [p[i] for i in range(self.laws[number].size)])
         constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
-        function = ti.static(self.function(law, "particle_adjoint"))
+        function = ti.static(self.function(number, "particle_adjoint"))
         served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(law.name)):
+        if ti.static(self.scheduled(number)):
             ends = variables(self.real, ti.static(self.range_of_series()))
             function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
         else:
@@ -289,7 +289,7 @@ class CudaPhases(OrderPhases, PosePhases):
                 bar[target + AT_C + i][lane] = c_out[i]
                 bar[target + AT_F + i][lane] = f_out[i]
         else:
-            if ti.static(self.scheduled(law.name)):
+            if ti.static(self.scheduled(number)):
                 self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     @ti.func

@@ -8,7 +8,7 @@ one per axis, also 4-vectors: three components of momentum or velocity and the m
 from collections.abc import Callable
 from typing import Any
 
-from plab.laws import Law
+from plab.laws import LAWS
 from plab.sim.codegen.bitcode import bitcode_file, symbol
 from plab.sim.compiler import bitcode_function, ti
 from plab.sim.spectral import (
@@ -82,17 +82,18 @@ class ParticlePhases(Storage):
 
     code_device: str
 
-    def function(self, unit: Law | str, name: str, real: Any = None) -> Callable[..., None]:
-        """Return a function of a law, or of ``transfers`` or ``atomics``, in the simulator's precision or
-        another; it takes local variables."""
+    def function(self, unit: int | str, name: str, real: Any = None) -> Callable[..., None]:
+        """Return a function of a law, by its number, or of ``transfers`` or ``atomics``, in the simulator's
+        precision or another; it takes local variables."""
+        # Not the law itself: Quadrants passes a dataclass field by field.
+        part = self.laws[unit] if isinstance(unit, int) else unit
         precision = "f32" if self.real == ti.f32 else "f64"
-        path = bitcode_file(self.code_device, precision, unit, len(self.laws) > 1)
-        return bitcode_function(path, symbol(unit, name, ENDINGS[real] if real else precision))
+        path = bitcode_file(self.code_device, precision, part, len(self.laws) > 1)
+        return bitcode_function(path, symbol(part, name, ENDINGS[real] if real else precision))
 
-    def scheduled(self, law: str) -> bool:
+    def scheduled(self, number: int) -> bool:
         """Return True if a law has a schedule of its own, with singular values beyond its series' range."""
-        # By its name: Quadrants passes a dataclass field by field.
-        return law == "von_mises"
+        return self.laws[number] is LAWS["von_mises"]
 
     # -- access to the particle state ---------------------------------------------------------------
 
