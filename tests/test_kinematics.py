@@ -8,7 +8,6 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -25,6 +24,9 @@ from plab.problem import Problem
 from plab.runners.planners.starts import ContactStarts
 from plab.scenes import Body, Manipulator, Scene, SceneError
 from plab.sim import Simulator
+
+mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("gymnasium_robotics")
 
 STEPS = 3
 

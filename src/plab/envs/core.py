@@ -345,7 +345,9 @@ class EpisodeBatch:
         self._over = np.zeros(self.size, bool)
         # Of environments with the same configuration, each has draws of its own.
         ids = [id(cfg) for cfg in self.configs]
-        self._seeds = [(cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)]
+        self._seeds: list[tuple[int, ...]] = [
+            (cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)
+        ]
         self._episodes = np.full(self.size, -1)
         self._simulator.reset()
         self._observe_starts()

@@ -85,7 +85,9 @@ class Draws:
         }
         targets = zip(problem.target_mass, problem.distances(), strict=True)
         self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, targets, strict=True)]
-        self._placed = [(base, {}, _places(base.scene)) for base in self._bases]
+        self._placed: list[tuple[_Base, Values, Any]] = [
+            (base, {}, _places(base.scene)) for base in self._bases
+        ]
         self._targets: list[Any] = [None for _ in cfgs]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
         for cfg in unique.values():

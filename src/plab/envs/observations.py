@@ -226,7 +226,7 @@ class Sensors:
     def _target_observations(self) -> dict[str, Constants]:
         """Return what is observed of the targets, made anew when they change."""
         names = {"target_mass", "target_points"} & set(self.names)
-        masses = cast(Simulator, self._simulator).target_mass if names else self._known_target
+        masses: Any = cast(Simulator, self._simulator).target_mass if names else self._known_target
         if masses is not self._known_target:
             self._known_target, made = masses, {}
             if "target_mass" in names:

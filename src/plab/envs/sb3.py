@@ -86,7 +86,7 @@ class PlabVecEnv(VecEnv):
             raise ArgumentError(
                 "options differ between sub-environments: give values one per sub-environment"
             )
-        seeds = None if None in self._seeds else self._seeds
+        seeds = [seed for seed in self._seeds if seed is not None] or None
         observation, info = self.batch.reset(seeds=seeds, options=self._options[0], episode=self.next_episode)
         self.next_episode = None
         self.reset_infos = self._split(info, {})

@@ -95,9 +95,9 @@ class Sb3Training(Training):
         self._cycle_steps = method.num_envs * (batch.horizon if rollout is None else rollout(method))
         super().__init__(cfgs, batch, self._cycle_steps)
         self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
-        envs = PlabVecEnv(batch)
-        envs.together = True
-        self._env = VecMonitor(envs)
+        self._envs = PlabVecEnv(batch)
+        self._envs.together = True
+        self._env = VecMonitor(self._envs)
         arguments = self._kind.arguments(method, self._env)
         if isinstance(method, OffPolicyConfig):
             kept = {"sizes": self._sizes, "total_steps": self.total_steps}
@@ -165,7 +165,7 @@ class Sb3Training(Training):
         written = io.BytesIO(state["model"].tobytes())
         self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
         self._set_logger()
-        self._env.unwrapped.next_episode = self.episodes // self._sizes.envs
+        self._envs.next_episode = self.episodes // self._sizes.envs
         self._env.reset()
         for actions in state["episode_actions"]:
             self._env.step(actions)

@@ -128,6 +128,8 @@ class Simulator:
         self._starts = Starts(self._engine)
         self._initial = self._particles.array(1)
         self._drive: Drive | None = None
+        self._joints: Any = None
+        self._initial_joints: np.ndarray | None = None
         self._start_from(particles)
         # Changes with all that a rollout's gradient depends on.
         self._version = 0
@@ -301,7 +303,7 @@ class Simulator:
             return
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
         self._particles.order.reset()
-        self._joints: Any = self._initial_joints
+        self._joints = self._initial_joints
         self._place(self._initial_poses)
         self._checked = True
 
@@ -424,7 +426,7 @@ class Simulator:
                 )
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ArgumentError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
-        shapes = [() if one is None else one.shape for one in (state.joints, self._initial_joints)]
+        shapes = [np.shape(() if one is None else one) for one in (state.joints, self._initial_joints)]
         if shapes[0] != shapes[1]:
             raise ArgumentError(f"joints have shape {shapes[0]}, not {shapes[1]}")
         self._checked_particles(state.x)
@@ -736,7 +738,7 @@ class Simulator:
         self._initial_poses = initial_poses(self.scenes)
         chain = self.scenes[0].kinematics
         self._map = chain.action_map(self.scenes) if chain else None
-        self._initial_joints: np.ndarray | None = self._map.start if self._map else None
+        self._initial_joints = self._map.start if self._map else None
 
     def _checked_particles(self, x: ArrayLike) -> np.ndarray:
         return checked_positions(x, self.particle_count, self.grid_size)
