@@ -97,6 +97,7 @@ def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path)
     assert policy_path(again.path).read_bytes() == policy_path(cfg.path).read_bytes()
 
 
+@pytest.mark.nightly
 def test_parameters_are_found_from_observed_particles(tmp_path: Path) -> None:
     words = ["task=Torus", "variant=1", *COARSE, "observe_particles=30"]
     assert main([*words, "--output", str(tmp_path)]) == 0

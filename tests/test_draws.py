@@ -174,7 +174,7 @@ def test_refusals() -> None:
     assert load_config(["task=Move"]).hash == load_config(["task=Move", "+task.randomize={}"]).hash
 
 
-@pytest.mark.parametrize("method", ["ppo", "pods"])
+@pytest.mark.parametrize("method", ["ppo", pytest.param("pods", marks=pytest.mark.nightly)])
 def test_methods_train_in_drawn_episodes(method: str, tmp_path: Path) -> None:
     """Another range leads to other training and to an evaluation in the same scene."""
     words = [f"method={method}", "task=Move", *COARSE, f"results_dir={tmp_path}", "progress=false"]

@@ -36,6 +36,7 @@ def small(*manipulators: Manipulator, **changes) -> Scene:
     return Scene("small", (body,), manipulators, grid_size=16, substeps=5, dt=4e-4, horizon=STEPS, **changes)
 
 
+@pytest.mark.nightly
 def test_links_move_as_the_rules_of_the_suite_do(device: str) -> None:
     """A box and a sphere by their own rules, and as links by twists: the same states and gradients."""
     tilt = (np.cos(0.2), 0.0, 0.0, np.sin(0.2))

@@ -46,7 +46,7 @@ def on_some_computer(tmp_path, monkeypatch):
 COMPOSED = {
     # choices
     "task=Ropee": "did you mean Rope?",
-    "task=null": "Assembly, Chopsticks, Move",
+    "task=null": "Assembly, Chopsticks, Gripper",
     "method=adm": "did you mean adam?",
     "sim=slow": "fast, reference",
     "+sim=reference": "sim=reference",

@@ -16,7 +16,8 @@ from scipy.ndimage import binary_dilation, binary_erosion
 import reference_mpm
 from plab import results
 from plab.cli.rollouts import render as main
-from plab.config import choices, load_config
+from plab.config import load_config
+from plab.config.suite import suite_tasks
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
@@ -135,7 +136,7 @@ def test_the_camera_of_a_scene_sees_manipulators_and_target():
     camera = scene_camera(scene(SPHERE), box_mass(GHOST), SIZE)
     seen = camera.project(np.array([SPHERE.position, GHOST, CUBE.center]), SIZE)
     assert np.all((seen > 0) & (seen < SIZE))
-    assert set(choices("task")) == set(VIEWS)
+    assert set(suite_tasks()) == set(VIEWS)
     unknown = dataclasses.replace(scene(SPHERE), name="Own")
     assert math.isfinite(sum(scene_camera(unknown).position))
 

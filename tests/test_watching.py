@@ -63,7 +63,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     seen = screen.getvalue()
     assert "Rope-v1 adam seed 0 build" in seen and "Rope-v1 adam seed 0 final evaluation" in seen
     assert re.search(r"compiling \w+", seen)
-    assert re.search(r"loss [\d.]+ soft score \d\.\d{3} best", seen)
+    assert re.search(r"loss [\d.]+ score of the best actions \d\.\d{3}", seen)
     *_, score, hint = capsys.readouterr().out.splitlines()
     assert score.startswith("finished: score 0.0000, results/Rope-v1/adam/seed0-")
     assert f"plab render {score.rpartition(' ')[2]};" in hint

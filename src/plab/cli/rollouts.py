@@ -14,6 +14,7 @@ from plab.config import choices, load_config
 from plab.config.compose import check_sources
 from plab.config.run import IDLE
 from plab.config.selection import one_protocol, select
+from plab.config.suite import EXTENSION_TASKS
 from plab.config.words import require_effect
 from plab.errors import ArgumentError
 from plab.render.graphics import RenderError, require_graphics, require_packages
@@ -261,11 +262,12 @@ def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
 
 
 def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[str, list[Config]]]:
-    """Return the configurations of every task, of all its variants or of the default one."""
+    """Return the configurations of every task of the suite, of all its variants or of the default one."""
     from omegaconf import OmegaConf
 
     found = []
-    for task, path in choices("task", options.config_dir).items():
+    tasks = choices("task", options.config_dir).items()
+    for task, path in (one for one in tasks if one[0] not in EXTENSION_TASKS):
         own = [[f"variant={name}"] for name in OmegaConf.load(path).variants] if variants else [[]]
         words = [[f"task={task}", *variant, *options.what] for variant in own]
         found.append((task, [load_config(each, options.config_dir) for each in words]))

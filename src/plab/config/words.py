@@ -19,6 +19,7 @@ from omegaconf.errors import (
 )
 from yaml import MarkedYAMLError, YAMLError
 
+from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ConfigError, pick
 
 FOLDERS = ("results_dir", "targets.source")
@@ -87,6 +88,8 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
         raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")
     if isinstance(value, Glob):
         found = value.filter(list(names))
+        # glob(*) is the suite; glob(Hand*) are tasks beside it.
+        found = [name for name in found if name not in EXTENSION_TASKS] or found
     elif override.is_sweep_override():
         try:
             found = list(override.sweep_string_iterator())
