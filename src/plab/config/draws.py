@@ -27,7 +27,7 @@ NOISE, SCENE, SCENES = "observation_noise", "scene", "scenes"
 """Standard deviation of the noise on observations, number of the drawn scene, and how many there are."""
 
 _POSITIONS = {"bodies": "center", "manipulators": "position"}
-"""What ``offset`` is added to."""
+"""Keys of the positions that ``offset`` shifts."""
 
 _FIXED = ("particles", "size", "center", "dt")
 """Numbers of a body that cannot differ between episodes, or are moved by ``offset``."""
