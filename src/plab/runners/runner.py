@@ -108,6 +108,7 @@ class Runner:
             plab.sim.SimulationError: If a state, loss or gradient stops being finite.
             plab.runners.RunError: If it cannot go on for another reason.
         """
+        # Not abstract, as build: a family that overrides iterate() has no step.
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:

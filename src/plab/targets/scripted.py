@@ -99,6 +99,7 @@ class Script(Recipe, ABC):
         values = {key: getattr(self, key) for key in MATERIAL_KEYS}
         return {key: value for key, value in values.items() if value is not None}
 
+    @abstractmethod
     def actions(self, scene: Scene) -> np.ndarray:
         """Draw the demonstration's actions.
 
@@ -111,6 +112,14 @@ class Script(Recipe, ABC):
         Raises:
             TargetError: If a parameter has a wrong value, or no drawn way fits into an episode.
         """
+
+
+@dataclass
+class PlannedScript(Script):
+    """A demonstration that draws one way for each manipulator."""
+
+    def actions(self, scene: Scene) -> np.ndarray:
+        """See :meth:`Script.actions`."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         if not any(m.action_dim for m in scene.tools):
@@ -133,7 +142,7 @@ class Script(Recipe, ABC):
 
 
 @dataclass
-class PressTarget(Script):
+class PressTarget(PlannedScript):
     """A manipulator comes down on the first body, off its centre, and goes up again.
 
     Attributes:
@@ -156,7 +165,7 @@ class PressTarget(Script):
 
 
 @dataclass
-class DrawTarget(Script):
+class DrawTarget(PlannedScript):
     """A pen draws straight strokes over the first body's top, one where the last ended, and is lifted.
 
     Attributes:
@@ -195,7 +204,7 @@ class DrawTarget(Script):
 
 
 @dataclass
-class DentTarget(Script):
+class DentTarget(PlannedScript):
     """A sphere pushes dents into the first body, each towards its centre.
 
     Attributes:
@@ -233,7 +242,7 @@ class DentTarget(Script):
 
 
 @dataclass
-class RollTarget(Script):
+class RollTarget(PlannedScript):
     """A rolling pin goes to and fro over the first body while it comes down.
 
     Attributes:
@@ -260,7 +269,7 @@ class RollTarget(Script):
 
 
 @dataclass
-class LiftTarget(Script):
+class LiftTarget(PlannedScript):
     """Chopsticks lift the first body, move it sideways and turn it, so that its ends hang and trail.
 
     Attributes:
@@ -287,7 +296,7 @@ class LiftTarget(Script):
 
 
 @dataclass
-class CarryTarget(Script):
+class CarryTarget(PlannedScript):
     """Two spheres grip the last body, set it on the first and let go.
 
     Attributes:
@@ -319,7 +328,7 @@ class CarryTarget(Script):
 
 
 @dataclass
-class PushTarget(Script):
+class PushTarget(PlannedScript):
     """A sphere between the legs of a table pushes one of them outwards, at the end of the episode: the rest
     of the table stays where it is.
 
@@ -408,10 +417,6 @@ class GestureTarget(Script):
         actions = np.zeros((EPISODE_STEPS, scene.action_dim))
         actions[: len(rows)] = np.reshape(rows, (len(rows), -1))
         return actions
-
-    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """Not used: a gesture moves joints."""
-        raise NotImplementedError
 
 
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
