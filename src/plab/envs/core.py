@@ -184,12 +184,12 @@ class Transition:
 
     @property
     def over(self) -> np.ndarray:
-        """Whether episodes have ended, for whatever reason, shape [batch]."""
+        """Mask of the episodes that have ended, for whatever reason, shape [batch]."""
         return self.terminated | self.cut_off
 
     @property
     def cut_off(self) -> np.ndarray:
-        """Whether episodes have reached the horizon or broken off, shape [batch]."""
+        """Mask of the episodes that have reached the horizon or diverged, shape [batch]."""
         broken = np.zeros_like(self.truncated)
         broken[list(self.failures)] = True
         return self.truncated | broken
@@ -373,7 +373,7 @@ class EpisodeBatch:
 
     @property
     def over(self) -> np.ndarray:
-        """Which episodes have ended and are to be reset, shape [batch]."""
+        """Mask of the episodes that have ended and are to be reset, shape [batch]."""
         over = self._over.copy()
         over[list(self._failures)] = True
         return over

@@ -99,7 +99,7 @@ class Draws:
 
     @property
     def changed(self) -> bool:
-        """Whether a sub-environment is not as it is configured."""
+        """True if a sub-environment differs from its configuration."""
         return any(self.values)
 
     def release(self) -> None:

@@ -113,7 +113,7 @@ class Chain:
 
     @property
     def topology(self) -> tuple[object, ...]:
-        """What is the same for the chains of all scenes of one simulator."""
+        """Structure that the chains of all scenes of one simulator share."""
         joints = tuple((joint.parent, joint.hinge, joint.component) for joint in self.joints)
         return joints, tuple((link.parent, link.shape) for link in self.links)
 

@@ -31,7 +31,7 @@ class Parameter:
     meaning: str = ""
 
     def admits(self, value: float) -> bool:
-        """Whether a value is in the interval."""
+        """Return True if a value is in the interval."""
         low, high = (float(end) for end in self.interval[1:-1].split(","))
         above = value >= low if self.interval[0] == "[" else value > low
         return above and (value <= high if self.interval[-1] == "]" else value < high)

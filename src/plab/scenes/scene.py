@@ -87,22 +87,22 @@ class ManipulatorShape:
 
     @property
     def moves(self) -> bool:
-        """Whether it can move."""
+        """True if an action moves it."""
         return self.motion != "static"
 
     @property
     def turns(self) -> bool:
-        """Whether it can turn: whether its rotation depends on the actions."""
+        """True if its rotation depends on the actions."""
         return self.motion in ("roll", "grip", "rigid", "twist")
 
     @property
     def scaled(self) -> bool:
-        """Whether its actions are shares of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
+        """True if its actions are shares of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
         return self.motion != "twist"
 
     @property
     def grips(self) -> bool:
-        """Whether its gap depends on the actions."""
+        """True if its gap depends on the actions."""
         return self.motion == "grip"
 
 

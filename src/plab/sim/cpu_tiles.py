@@ -286,7 +286,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def has_law(self, entry9, number: ti.template()):
-        """Whether any lane of a tile has the law of a number."""
+        """Return True if any lane of a tile has the law of a number."""
         if ti.static(len(self.laws) > 1):
             return self.tile_laws[entry9 // 9] & (1 << number) != 0
         else:
@@ -384,7 +384,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
-        """Whether a particle has the law of a number."""
+        """Return True if a particle has the law of a number."""
         if ti.static(len(self.laws) > 1):
             row = entry9 // 9 * ti.static(self.place_rows) + self.coefficients
             return self.place_material[row][lane] == ti.cast(number, self.real)

@@ -98,7 +98,7 @@ class GridPhases(Storage):
 
     @ti.func
     def is_near(self, shape: ti.template(), e, s, m, block):
-        """Whether manipulator m can reach a node of a block in substep s."""
+        """Return True if manipulator m can reach a node of a block in substep s."""
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx

@@ -198,7 +198,7 @@ def register_user(user: object) -> None:
 
 
 def is_current(runtime: Runtime) -> bool:
-    """Whether a runtime is still the one in force.
+    """Return True if a runtime is still the active one.
 
     Raises:
         RuntimeError: If this process was forked from the one that has started it.

@@ -147,14 +147,14 @@ class Code:
         return ir.Constant(ir.VectorType(self.real, LANE), [self.real(number)] * LANE)
 
     def below(self, a: ir.Value, b: ir.Value, *, equal: bool = False) -> ir.Value:
-        """Where a number is less than another, or as large; nowhere where one is NaN."""
+        """Mask of the lanes in which a < b, or a <= b if ``equal``; False for NaN."""
         return self._b.fcmp_ordered("<=" if equal else "<", a, b)
 
     def equal(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fcmp_ordered("==", a, b)
 
     def implied(self, condition: ir.Value, other: ir.Value) -> ir.Value:
-        """Where ``other`` holds or ``condition`` does not."""
+        """Mask of the lanes in which ``other`` holds or ``condition`` does not."""
         return self._b.or_(self._b.not_(condition), other)
 
     def chosen(self, where: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
@@ -279,7 +279,7 @@ class Scalars(Code):
         return self.real(number)
 
     def all_of(self, *conditions: ir.Value) -> ir.Value:
-        """Whether all conditions are met."""
+        """Return the conjunction of conditions."""
         return reduce(self._b.and_, conditions)
 
     def flag(self, condition: ir.Value) -> ir.Value:
@@ -287,7 +287,7 @@ class Scalars(Code):
         return self._b.uitofp(condition, self.real)
 
     def where(self, condition: ir.Value) -> AbstractContextManager[Any]:
-        """What is written within happens where a condition is met."""
+        """Write a block that runs only if a condition is met."""
         return self._b.if_then(condition)
 
     def variables(self, values: Sequence[ir.Value]) -> list[ir.Value]:

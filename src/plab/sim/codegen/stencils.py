@@ -185,7 +185,7 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
 
 
 def gather_sums(module: ir.Module, name: str, real: ir.Type) -> None:
-    """What a particle's adjoint needs of the grid: sums over its nodes of w p, and of w p times the node's
+    """Sums over the grid for a particle's adjoint: over its nodes of w p, and of w p times the node's
     offset (0, 1, 2) along x, y and z, 3-vectors in ``m``, where p is the momentum's adjoint; and in ``t`` the
     sum of grad_f w (p . q + velocity . h), where ``q`` and ``h`` are affine fields of 4-vectors: value at the
     base node and increments along x, y, z. ``w`` are weights by node and axis, ``s`` their slopes."""
