@@ -88,7 +88,7 @@ COARSE = [
     f"sim.device={DEVICE}",
 ]
 EVERYTHING = {
-    "observe": ["state", "particles", "points", "depth", "rgb", "segmentation"],
+    "observe": ["state", "particles", "points", "depth", "rgb", "segmentation", "impulses"],
     "cameras": {"top": {"position": (0.5, 2.0, 0.5), "target": (0.5, 0.0, 0.5), "size": (24, 16)}},
 }
 
@@ -110,7 +110,9 @@ def test_environments_observe_by_key():
     assert np.mean((points[:, 1] > center[1]) == (points[:, 3] > 0)) > 0.8
     for _ in range(many.unwrapped.batch.horizon):
         action = env.action_space.sample()
-        one, *_rest = env.step(action)
+        one, *_rest, info = env.step(action)
+        assert np.abs(info["impulses"]).max() > 0.0
+        np.testing.assert_array_equal(one["impulses"], info["impulses"].astype(np.float32))
         both, *_rest, infos = many.step(np.stack([action, action]))
     last = infos["final_obs"][1]
     assert last in env.observation_space and both in many.observation_space
@@ -143,9 +145,13 @@ def test_tensors_by_key_stay_on_the_device():
     from plab.envs.core import EpisodeBatch
     from plab.envs.tensors import TensorEnv
 
-    env = TensorEnv(EpisodeBatch([load_config(["task=Move", *COARSE])] * 2, observe=["state", "rgb"]))
+    env = TensorEnv(
+        EpisodeBatch([load_config(["task=Move", *COARSE])] * 2, observe=["state", "rgb", "impulses"])
+    )
     first = env.reset()
     later = env.step(torch.ones(2, env.batch.action_space.shape[0], device=env.device)).observation
+    again = env.reset(environments=[1])["impulses"]
+    assert torch.equal(again[0], later["impulses"][0]) and again[0].any() and not again[1].any()
     for seen in (first, later):
         assert {value.device.type for value in seen.values()} == {DEVICE}
         assert seen["front_rgb"].dtype == torch.uint8 and seen["front_rgb"].shape == (2, 64, 64, 3)

@@ -266,3 +266,40 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
         np.testing.assert_array_equal(got.step_terms, want.step_terms[:count])
         np.testing.assert_array_equal(got.gradient, want.gradient[:count])
         np.testing.assert_array_equal(state.x, final.x[:count])
+
+
+def test_impulses_are_the_momentum_that_bodies_lose(device: str) -> None:
+    """A ball that two boxes squeeze, and one that comes to rest on a box, in one batch."""
+    ball = (Body("sphere", (0.5, 0.5, 0.5), (0.1,), 300),)
+
+    def scene(*tools: tuple[tuple[float, ...], tuple[float, ...]]) -> Scene:
+        boxes = tuple(Manipulator("Box", size, at, scale=(0.02,) * 6) for size, at in tools)
+        return Scene("boxes", ball, boxes, grid_size=16, substeps=5, dt=2e-4)
+
+    hands = scene(((0.05, 0.2, 0.2), (0.35, 0.5, 0.5)), ((0.05, 0.2, 0.2), (0.65, 0.5, 0.5)))
+    table = scene(((0.2, 0.05, 0.2), (0.5, 0.36, 0.5)), ((0.05, 0.05, 0.05), (0.1, 0.9, 0.1)))
+    settings = {"precision": "float64", "device": device}
+    simulator = Simulator((hands, table), impulses=True, **settings)
+    simulator.set_contact("hard")
+    simulator.rollout(np.ones((2, 2, 12)), gradient=False)
+    actions = np.zeros((2, 12))
+    actions[0, 0], actions[0, 6] = 0.2, -0.15
+    mass, duration = 300 * hands.particle_mass, 5 * 2e-4
+    weight, pressed = mass * 30.0 * duration, []
+    simulator.reset()
+    assert not simulator.impulses().any()
+    for _ in range(200):
+        before = simulator.state().v.mean(axis=1) * mass
+        simulator.step(actions)
+        gained = simulator.state().v.mean(axis=1) * mass - before - [0.0, -weight, 0.0]
+        np.testing.assert_allclose(simulator.impulses().sum(axis=1), -gained, atol=1e-8 * mass)
+        pressed.append(simulator.impulses())
+        actions[0] *= 0.9
+    squeezed, resting = np.array(pressed)[:, 0, :, 0], np.array(pressed)[-50:, 1].mean(axis=0)
+    assert squeezed[:, 0].min() < -5.0 * weight and squeezed[:, 1].max() > 5.0 * weight
+    np.testing.assert_allclose(resting, [[0.0, -weight, 0.0], [0.0] * 3], atol=0.02 * weight)
+    end, plain = simulator.state(), Simulator((hands, table), **settings)
+    with pytest.raises(RuntimeError, match="impulses"):
+        plain.impulses()
+    simulator.set_state(end)
+    assert not simulator.impulses().any()

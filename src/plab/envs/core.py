@@ -23,7 +23,7 @@ from plab.config.words import prepared
 from plab.envs.draws import Draws
 from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.errors import ArgumentError
-from plab.problem import Problem, build_scenes, kinds_of
+from plab.problem import Problem, build_scenes, kinds_of, make_simulator
 from plab.scenes import CONTACTS, Camera
 from plab.sim import SimulationError, Simulator, State
 from plab.sim.tensors import Constants, on_device
@@ -203,7 +203,7 @@ class EpisodeState:
         steps: Steps taken in the episodes, shape [batch]; None before the first :meth:`EpisodeBatch.reset`.
         simulation: Particles and manipulators, shape [batch, ...] each.
         failures: Environments that have broken off.
-        last: Observations, loss terms and IoU of the last step.
+        last: Observations, loss terms, IoU and impulses, if they are asked for, of the last step.
         seeds: Entropy of the environments' draws.
         episodes: Numbers of the episodes, shape [batch].
         over: Which episodes have ended by a success or at the horizon, shape [batch].
@@ -245,6 +245,7 @@ class EpisodeBatch:
         observe: str | Sequence[str] = "state",
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
         randomize: Mapping[str, Any] | None = None,
+        impulses: bool = False,
         success_score: float = 0.9,
         terminate_on_success: bool = False,
         render_size: tuple[int, int] = (480, 360),
@@ -260,6 +261,7 @@ class EpisodeBatch:
             cameras: Cameras by name, or their attributes; those of the task if None, or one named ``front``.
             randomize: Ranges of what each episode draws, in place of the tasks' own, see
                 :mod:`plab.config.draws`; empty: nothing.
+            impulses: Whether ``info`` has the impulses on the manipulators; so it has if they are observed.
             success_score: Score from which on a state is a success.
             terminate_on_success: Whether a success ends the episode.
             render_size: Width and height of pictures [pixels].
@@ -279,7 +281,8 @@ class EpisodeBatch:
         self._randomize, self._success_score = randomize, success_score
         self._terminates = terminate_on_success
         cfgs = self._ranged(cfgs)
-        problem = Problem(cfgs)
+        self._sums_impulses = impulses or "impulses" in observe
+        problem = Problem(cfgs, make_simulator(cfgs, impulses=self._sums_impulses))
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
         self._picture_size, self._picture_target = render_size, render_target
         self._renderers: list[Renderer] = []
@@ -356,7 +359,7 @@ class EpisodeBatch:
         """Measure and observe the initial states of all environments, in which they are."""
         self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
-        # Observations, loss terms and IoU of the last step, which environments that break off keep.
+        # Observations and measures of the last step, which environments that break off keep.
         self._initial = self._last = self._seen()
         self._initial_loss = Constants(self.problem.loss_of(self._initial[1]))
 
@@ -431,16 +434,16 @@ class EpisodeBatch:
         self._simulator.reset(None if environments is None else rows)
         before = self._last
         if changed or self.draws.changed or environments is not None or on_device(like):
-            measures = self._simulator.measure(like)
+            terms, iou, *others = self._measured(like)
             if changed:
-                self._note_starts(rows, measures.terms, measures.iou)
-            self._last = self._observe(like), measures.terms, measures.iou
+                self._note_starts(rows, terms, iou)
+            self._last = self._observe(like), terms, iou, *others
         else:
             self._last = self._initial
         self._keep(before, [e for e in range(self.size) if e not in rows])
         # Copies: a caller may keep and change what it is given.
-        observation, terms, iou = self._last = _copies(self._last)
-        return mapped(_copy, observation), self._info(terms, iou)
+        observation, *measured = self._last = _copies(self._last)
+        return mapped(_copy, observation), self._info(*measured)
 
     def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
         """Score and reward environments by the initial states, in which they are."""
@@ -490,16 +493,16 @@ class EpisodeBatch:
         # Queued before the wait for the measures.
         observation = self._observe(actions)
         try:
-            measures = simulator.measure(actions)
+            measured = self._measured(actions)
         except SimulationError as error:
             if strict:
                 raise
             # Raised once a step: the second call returns the measures of the others.
-            self._failures, measures = error.failures | self._failures, simulator.measure(actions)
-        before, self._last = self._last, (observation, measures.terms, measures.iou)
+            self._failures, measured = error.failures | self._failures, self._measured(actions)
+        before, self._last = self._last, (observation, *measured)
         self._keep(before, list(self._failures))
-        observation, terms, iou = _copies(self._last)
-        info = self._info(terms, iou)
+        observation, *measured = _copies(self._last)
+        info = self._info(*measured)
         reward = self._initial_loss.like(actions) - info["loss"]
         terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
@@ -554,8 +557,8 @@ class EpisodeBatch:
         self._over = state.over.copy()
         self._failures, self._last = dict(state.failures), _copies(state.last)
         self._seeds, self._episodes = list(state.seeds), state.episodes.copy()
-        observation, terms, iou = _copies(self._last)
-        return observation, self._info(terms, iou)
+        observation, *measured = _copies(self._last)
+        return observation, self._info(*measured)
 
     @_alone
     def closed_loop(
@@ -664,12 +667,18 @@ class EpisodeBatch:
         ]
         return self._sensors.noisy(observation, deviations, rngs, self._observer.constant)
 
-    def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
-        """Return observations, loss terms and IoU of the current states."""
-        measures = self._simulator.measure(like)
-        return self._observe(like), measures.terms, measures.iou
+    def _seen(self, like: Array = None) -> tuple[Array, ...]:
+        """Return observations and measures of the current states."""
+        measured = self._measured(like)
+        return self._observe(like), *measured
 
-    def _info(self, terms: Array, iou: Array) -> dict[str, Any]:
+    def _measured(self, like: Array = None) -> tuple[Array, ...]:
+        """Return loss terms, IoU and, if they are asked for, impulses of the current states."""
+        measures = self._simulator.measure(like)
+        impulses = (self._simulator.impulses(like),) if self._sums_impulses else ()
+        return measures.terms, measures.iou, *impulses
+
+    def _info(self, terms: Array, iou: Array, impulses: Array = None) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
         drawn = self.draws.info()
         return {
@@ -679,6 +688,7 @@ class EpisodeBatch:
             "score": score,
             "score_printed": printed,
             "success": score >= self._success_score,
+            **({} if impulses is None else {"impulses": impulses}),
             **({"randomized": drawn} if drawn else {}),
         }
 

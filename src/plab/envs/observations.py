@@ -21,7 +21,7 @@ __all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "sp
 
 PICTURES = ("depth", "rgb", "segmentation")
 
-OBSERVATIONS = ("state", "particles", "points", "mass", "target_mass", "target_points", *PICTURES)
+OBSERVATIONS = ("state", "particles", "points", "mass", "target_mass", "target_points", "impulses", *PICTURES)
 """Names of what can be observed."""
 
 CELLS = 16
@@ -181,6 +181,8 @@ class Sensors:
             spaces[name] = Box(0.0, 1.0, (CELLS,) * 3, np.float32)
         if "target_points" in self.names:
             spaces["target_points"] = Box(0.0, 1.0, (points, 3), np.float32)
+        if "impulses" in self.names:
+            spaces["impulses"] = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
         self._point_count, self._known_target = points, np.empty(0)
         for name, camera in self.cameras.items():
             width, height = camera.size
@@ -213,6 +215,9 @@ class Sensors:
             out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
         if "mass" in self.names:
             out["mass"] = _shares(cast(Simulator, self._simulator).observe(1, like)[..., :3])
+        if "impulses" in self.names:
+            impulses = cast(Simulator, self._simulator).impulses(like)
+            out["impulses"] = impulses.float() if on_device(impulses) else impulses.astype(np.float32)
         for name, values in self._target_observations().items():
             known = values.like(like)
             out[name] = known.float() if on_device(known) else known.astype(np.float32)
@@ -249,7 +254,7 @@ class Sensors:
         """
 
         def one(name: str, values: Array, space: Box) -> Array:
-            if name.endswith(("rgb", "segmentation", "mass", "target_points")):
+            if name.endswith(("rgb", "segmentation", "mass", "target_points", "impulses")):
                 return values
             noise = np.stack([rng.standard_normal(space.shape, np.float32) for rng in rngs])
             noise *= deviations.astype(np.float32).reshape(-1, *[1] * len(space.shape))

@@ -52,6 +52,27 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
             8, ti.f64, shape=(self.batch, self.chunks if self.beyond_nearest else 1, m)
         )
 
+    def allocate_impulses(self) -> None:
+        """Allocate the sums of impulses, before the first kernel is compiled."""
+        self.sums_impulses = True
+        self.impulse_part = ti.Vector.field(
+            3, ti.f64, shape=(self.batch * self.chunks, max(1, self.manipulators))
+        )
+
+    @ti.func
+    def add_impulse(self, row, m, value):
+        """Add to a chunk's share of an impulse, which one thread owns."""
+        self.impulse_part[row, m] = self.impulse_part[row, m] + ti.cast(value, ti.f64)
+
+    @ti.func
+    def take_impulse(self, e, m, i: ti.template()):
+        """Return a component of an impulse, and set it to 0."""
+        total = ti.cast(0.0, ti.f64)
+        for c in range(self.chunks):
+            total += self.impulse_part[e * self.chunks + c, m][i]
+            self.impulse_part[e * self.chunks + c, m][i] = 0.0
+        return total
+
     # -- shares -------------------------------------------------------------------------------------
 
     @ti.func
@@ -123,7 +144,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                 i = self.node_of_block(block, r)
                 node = self.linear(i)
                 total = self.take(self.momentum, e, node, holders)
-                v = self.update_node(e, s, i, near, total)
+                v = self.update_node(e * self.chunks + c, e, s, i, near, total)
                 self.velocity[e * self.nodes + node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
 
     @ti.func

@@ -87,6 +87,22 @@ class CudaPhases(OrderPhases, PosePhases):
         self.pose_sums = self.sums(self.batch * max(1, self.manipulators) * 8)
         self.material_sums = self.sums(self.material_bar.shape[0] * self.coefficients)
 
+    def allocate_impulses(self) -> None:
+        """Allocate the sums of impulses, before the first kernel is compiled."""
+        self.sums_impulses = True
+        self.impulse_sums = self.sums(self.batch * max(1, self.manipulators) * 3)
+
+    @ti.func
+    def add_impulse(self, row, m, value):
+        """Add to an environment's impulse; ``row`` is its number."""
+        for i in ti.static(range(3)):
+            self.add_up(self.impulse_sums, (row * self.manipulators + m) * 3 + i, ti.cast(value[i], ti.f64))
+
+    @ti.func
+    def take_impulse(self, e, m, i: ti.template()):
+        """Return a component of an impulse, and set it to 0."""
+        return self.take_sum(self.impulse_sums, (e * self.manipulators + m) * 3 + i)
+
     # -- particles ----------------------------------------------------------------------------------
 
     @ti.func
@@ -536,7 +552,7 @@ class CudaPhases(OrderPhases, PosePhases):
         near = (1 << self.manipulators) - 1
         if ti.static(self.manipulators > FEW):
             near = self.near_block(w, e, s, block)
-        v = self.update_node(e, s, self.node_of_block(block, r), near, total)
+        v = self.update_node(e, e, s, self.node_of_block(block, r), near, total)
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
 
     @ti.func

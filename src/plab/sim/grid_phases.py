@@ -13,6 +13,7 @@ from plab.sim.storage import (
     BLOCK,
     Storage,
 )
+from plab.sim.tensors import Array
 
 MASS_MIN = 1e-12
 """Nodes with less mass are skipped."""
@@ -52,7 +53,13 @@ def slid_adjoint(t, rn, friction, bar):
 
 
 class GridPhases(Storage):
-    """Grid update and its adjoint, one node at a time."""
+    """Grid update and its adjoint, one node at a time.
+
+    Attributes:
+        sums_impulses: Sum the impulses on the manipulators; fixed when the kernels are compiled.
+    """
+
+    sums_impulses: bool = False
 
     @ti.func
     def node_of_block(self, block, r):
@@ -308,12 +315,35 @@ class GridPhases(Storage):
         return out
 
     @ti.func
-    def update_node(self, e, s, i, near, total):
-        """Velocity of a node at the end of the grid update, from its momentum and mass."""
+    def add_impulses(self, row, e, s, x, v, near, mass):
+        """Add the momentum that a node of velocity ``v`` before contact loses to each manipulator."""
+        out = v
+        for shape, start, stop in ti.static(self.shape_ranges):
+            for m in range(start, stop):
+                if near & (1 << m):
+                    after = self.contact(shape, e, s, m, x, out)
+                    lost = out - after
+                    if lost.norm_sqr() > 0.0:
+                        self.add_impulse(row, m, mass * lost)
+                    out = after
+
+    @ti.kernel
+    def take_impulses(self, out: Array):
+        """Write the impulses on the manipulators since the last call, 3 numbers each."""
+        for e, m in ti.ndrange(self.batch, self.manipulators):
+            for i in ti.static(range(3)):
+                out[(e * self.manipulators + m) * 3 + i] = self.take_impulse(e, m, i)
+
+    @ti.func
+    def update_node(self, row, e, s, i, near, total):
+        """Velocity of a node at the end of the grid update, from its momentum and mass; impulses are added to
+        the sums of a row."""
         v = ti.Vector([0.0 * total[0], 0.0 * total[0], 0.0 * total[0]])
         if total[3] > MASS_MIN:
             v = self.free_velocity(e, total)
             if near != 0:
+                if ti.static(self.sums_impulses):
+                    self.add_impulses(row, e, s, self.position(i), v, near, total[3])
                 v = self.after_manipulators(e, s, self.position(i), v, near, self.manipulators)
             v = self.walls(i, v, self.material[e][0])
         return v

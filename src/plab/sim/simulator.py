@@ -75,6 +75,7 @@ class Simulator:
         particles: Sequence[np.ndarray] | None = None,
         full_gradient: bool = False,
         deterministic: bool = False,
+        impulses: bool = False,
         _singular_values: bool = False,
     ) -> None:
         """Build the simulator and put all environments into their initial states.
@@ -93,6 +94,7 @@ class Simulator:
                 (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
             deterministic: Whether CUDA gives the same bits in every run and batch, see
                 :mod:`plab.sim.cuda_sums`; the CPU does in any case.
+            impulses: Whether :meth:`step` sums the impulses on the manipulators (:meth:`impulses`).
             _singular_values: Whether to decompose every strain into singular values, also where series
                 serve; for measurements of accuracy.
 
@@ -115,6 +117,8 @@ class Simulator:
 
             engine = CudaEngine
         self._engine = engine(self.scenes, self._runtime, full_gradient, deterministic, _singular_values)
+        if impulses:
+            self._engine.allocate_impulses()
         self._engine.attach(terms)
         self.terms: tuple[LossTerm, ...] = tuple(term for term in self._engine.terms if term.weighted)
         self._engine.fill_parameters(self.scenes)
@@ -123,6 +127,8 @@ class Simulator:
         self._scratch_terms = ti.ndarray(ti.f64, shape=self._engine.measures * self.batch)
         self._observed: dict[int, ti.Ndarray] = {}
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
+        size = self.batch * self.manipulator_count * 3
+        self._impulses = ti.ndarray(ti.f64, shape=max(1, size)) if impulses else None
         self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
         self._starts = Starts(self._engine)
@@ -291,6 +297,9 @@ class Simulator:
         if environments is not None:
             chosen = np.zeros(self.batch, np.int32)
             chosen[list(environments)] = 1
+            if self._impulses is not None:
+                kept = np.array(self.impulses()) * (chosen == 0)[:, None, None]
+                copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, 1)
             self._starts.copy_chosen(self._initial, self._particles.current, chosen)
             self._particles.order.reset(environments)
             poses = np.array(self.poses())
@@ -305,6 +314,7 @@ class Simulator:
         self._particles.order.reset()
         self._joints = self._initial_joints
         self._place(self._initial_poses)
+        self._clear_impulses()
         self._checked = True
 
     def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
@@ -322,7 +332,10 @@ class Simulator:
         self._version += 1
         through = (lambda given: self._follow(given, False).twists) if self._map else None
         array = step_actions(actions, self.batch, self.action_dim, self.device, through)
+        # What a rollout has left in the sums is none of this step's.
+        self._take_impulses()
         self._particles.step(self._pose, array)
+        self._take_impulses()
         self._taken += 1
         self._checked = check
         if check:
@@ -408,6 +421,32 @@ class Simulator:
         self._require_runtime()
         return numbers_of(self._pose, self._initial_poses.shape, like)
 
+    def impulses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
+        """Momentum that each manipulator has taken from the body in the last :meth:`step`, 0 after a reset.
+
+        Args:
+            like: Given a CUDA tensor, the result is one too, of its type.
+
+        Returns:
+            Impulses [mass x domain units / s], shape [batch, manipulator, 3]; divided by the duration of an
+            environment step they are mean forces.
+
+        Raises:
+            RuntimeError: If the simulator was built without ``impulses=True``.
+        """
+        self._require_runtime()
+        if self._impulses is None:
+            raise RuntimeError("build the simulator with impulses=True")
+        return numbers_of(self._impulses, (self.batch, self.manipulator_count, 3), like)
+
+    def _take_impulses(self) -> None:
+        if self._impulses is not None:
+            self._engine.take_impulses(self._impulses)
+
+    def _clear_impulses(self) -> None:
+        if self._impulses is not None:
+            self._impulses.fill(0.0)
+
     def set_state(self, state: State) -> None:
         """Replace the current state.
 
@@ -434,6 +473,7 @@ class Simulator:
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()
         self._joints = None if state.joints is None else np.array(state.joints, np.float64)
+        self._clear_impulses()
         self._place(np.asarray(state.poses, np.float64))
 
     def initial_state(self) -> State:
