@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 
 import reference_mpm as reference
 from plab.config import ConfigError, load_config
 from plab.envs.autograd import simulate
 from plab.losses import TERMS, check_gradient, make_terms
+from plab.losses.chamfer import POINTS
 from plab.losses.term import DistanceTerm
-from plab.objective import soft_iou
+from plab.objective import lumps, soft_iou
 from plab.results import check, load, read
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim import SimulationError, Simulator
@@ -72,6 +74,17 @@ def test_gradients_of_terms_are_those_of_their_measures(name: str, device: str) 
     term = Close() if name == "Close" else make_terms({"any": 1.0}, {"any": name})[0]
     errors = check_gradient(term, with_tools("Sphere", "Chopsticks"), device=device)
     assert max(errors.values()) < 1e-6, errors
+
+
+def test_chamfer_is_that_of_particles_and_points_of_the_target(device: str) -> None:
+    simulator = Simulator(with_tools("Sphere"), terms=make_terms({"chamfer": 1.0}), device=device)
+    mass = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3)) ** 8
+    simulator.set_target(mass, mass)
+    for _ in range(2):
+        got = simulator.losses()[:, 0]
+    for e, x in enumerate(simulator.state().x):
+        square = cdist(x, lumps(mass[e], POINTS)) ** 2
+        assert got[e] == pytest.approx(square.min(axis=0).mean() + square.min(axis=1).mean(), rel=1e-5)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -23,7 +23,7 @@ from plab.report.formats import NOTHING, Table, number
 from plab.report.hyperparameters import hyperparameters
 from plab.report.methods import method as look
 from plab.report.statistics import Summary, stratified_difference, summarise
-from plab.report.tables import agreement, iou_per_configuration, iou_per_task, timing
+from plab.report.tables import agreement, distances, iou_per_configuration, iou_per_task, timing
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load
 from plab.results.examples import EXAMPLES, example_archive
@@ -106,6 +106,16 @@ def test_cells_per_task(folder: Path) -> None:
     assert not tables["ours"].bold.any()
     bold = bold_cells(by_form(iou_per_task(gather(folder, "variant=1,2,3,4")))["ours"])
     assert bold.loc["Rope"].to_list() == [False, False, False, False, True, False, False]
+
+
+def test_distances_are_means_of_the_runs_that_have_them(tmp_path: Path) -> None:
+    for seed in range(3):
+        result = synthetic.run(tmp_path, score=0.5, seed=seed)
+        result.evaluation |= {"chamfer": 0.1 * seed} if seed else {}
+        synthetic.save(result)
+    (table,) = distances(gather(tmp_path))
+    (row,) = table.cells.to_dict("records")
+    assert (row["task"], row["distance"], row["Adam"], row["GD"]) == ("Rope", "Chamfer", "0.150 ± 0.050", NOTHING)
 
 
 def test_differences_and_rows_per_configuration(folder: Path) -> None:

@@ -25,6 +25,7 @@ __all__ = [
     "chamfer_distance",
     "check_terms",
     "earth_movers_distance",
+    "lumps",
     "mass_change",
     "rewards",
     "score_scale",
@@ -200,11 +201,11 @@ def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORTED)
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    distances = cdist(_lumps(np.asarray(a, np.float64), points), _lumps(np.asarray(b, np.float64), points))
+    distances = cdist(lumps(np.asarray(a, np.float64), points), lumps(np.asarray(b, np.float64), points))
     return float(distances[linear_sum_assignment(distances)].mean())
 
 
-def _lumps(mass: np.ndarray, count: int) -> np.ndarray:
+def lumps(mass: np.ndarray, count: int) -> np.ndarray:
     """Return the centroids of lumps of equal mass, shape [count, 3]."""
     node = np.argwhere(mass > 0.0)
     # Morton's order: the bits of the three indices in turn.
@@ -347,6 +348,7 @@ def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
 TERMS = {
     "density": "plab.losses.density:Density",
     "sdf": "plab.losses.sdf:Sdf",
+    "chamfer": "plab.losses.chamfer:Chamfer",
     "nearest": "plab.losses.contact:NearestContact",
     "all": "plab.losses.contact:AllContact",
     "soft": "plab.losses.contact:SoftContact",

@@ -78,8 +78,13 @@ class ParticleTerm(Term):
 
     @ti.func
     def gradient(self, e, x, v):
-        """Derivatives of :meth:`measure` by position and velocity, two 3-vectors."""
+        """Derivatives of the term by position and velocity, two 3-vectors."""
         return 0.0 * x, 0.0 * v
+
+    @ti.func
+    def finish(self, e):
+        """Return what environment ``e`` adds when all its particles are measured, float64."""
+        return ti.cast(0.0, ti.f64)
 
 
 class DistanceTerm(Term):

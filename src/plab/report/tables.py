@@ -27,6 +27,9 @@ _DIFFERENCE = (
     f"{CONFIDENCE:.0%} interval of Welch's t, its variance estimated within variants on both sides; no "
     "interval where a variant has one run."
 )
+DISTANCES = {"chamfer": "Chamfer", "earth_movers": "earth mover's"}
+"""Headings of distances by their columns in results."""
+
 INTERVAL = f"{CONFIDENCE:.0%} interval"
 """Heading of intervals."""
 
@@ -120,6 +123,33 @@ def iou_per_task(runs: Runs) -> list[Table]:
 def iou_per_configuration(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
     return _iou_tables(runs, "configuration", "over seeds")
+
+
+def distances(runs: Runs) -> list[Table]:
+    """Return the distances of final shapes from their targets, per task and method; nothing where no run has
+    them."""
+    measured = [name for name in DISTANCES if name in runs.table]
+    shown, data = [], []
+    for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), measured):
+        line = [task, DISTANCES[name]]
+        for m in runs.methods:
+            own = runs.table.query("task == @task and method == @m")[name].dropna()
+            found = summarise(own.to_numpy(float))
+            line.append(mean_and_std(found, 3) if found.count else NOTHING)
+            data.append({"task": task, "distance": name, "method": m, **_numbers(found, 0)})
+        shown.append(line)
+    labels = ["task", "distance", *(method(m).label for m in runs.methods)]
+    notes = ["Mean ± standard deviation over variants and seeds [domain units].", *settings_note(runs)]
+    made = Table(
+        "distances",
+        "ours",
+        "Distance of the final shape from the target, plab",
+        pd.DataFrame(shown, columns=labels),
+        pd.DataFrame(data),
+        None,
+        notes,
+    )
+    return [made] if shown else []
 
 
 def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:

@@ -15,6 +15,7 @@ from plab.report.hyperparameters import hyperparameters
 from plab.report.series import load_rows, load_series
 from plab.report.tables import (
     agreement,
+    distances,
     iou_per_configuration,
     iou_per_task,
     score_at_budget,
@@ -41,6 +42,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     tables = [
         *iou_per_task(runs),
         *iou_per_configuration(runs),
+        *distances(runs),
         *agreement(runs),
         *timing(runs, benchmark),
         *solvability(runs),

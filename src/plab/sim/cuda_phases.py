@@ -645,11 +645,12 @@ class CudaPhases(OrderPhases, PosePhases):
     def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):
         """Terms and distances of a particle of a thread's tile; all lanes of a warp take part."""
         if ti.static(len(self.particle_terms) > 0):
-            values = self.particle_measures(e, x, self.vector(state, entry + AT_V, lane))
+            values = ti.Vector.zero(ti.f64, ti.static(len(self.particle_terms)))
+            if counts:
+                values = self.particle_measures(e, x, self.vector(state, entry + AT_V, lane))
             for k in ti.static(range(len(self.particle_terms))):
-                share = ti.select(counts, values[k], 0.0)
                 # All lanes of a warp have particles of the same environment.
-                total = self.sum_of_warp(share)
+                total = self.sum_of_warp(values[k])
                 if w % WARP == 0:
                     self.add_measure(e, ti.static(len(self.node_terms) + k), total)
         if ti.static(len(self.distance_terms) > 0):

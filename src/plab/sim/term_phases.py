@@ -330,8 +330,8 @@ class TermPhases(Storage):
                 sums += self.particle_part[e, c]
         for k, column, term in ti.static(self.node_terms):
             terms[at + column] = term.empty(e) + part[k]
-        for k, column, _term in ti.static(self.particle_terms):
-            terms[at + column] = sums[k]
+        for k, column, term in ti.static(self.particle_terms):
+            terms[at + column] = sums[k] + term.finish(e)
         for k, column, term in ti.static(self.distance_terms):
             total = ti.cast(0.0, ti.f64)
             for shape, start, stop in ti.static(self.shape_ranges):

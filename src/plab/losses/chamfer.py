@@ -1,0 +1,84 @@
+"""Chamfer term: squared distances between the particles and points of the target, both ways.
+
+``mean_p min_k |x_p - y_k|^2 + mean_k min_p |x_p - y_k|^2`` over particles p and points k, which are the
+centroids of equal shares of the target's mass. Unlike density and SDF it also pulls particles to parts of the
+target that none is near to.
+"""
+
+import numpy as np
+
+from plab.losses.term import ParticleTerm
+from plab.objective import lumps
+from plab.sim.compiler import ti
+
+__all__ = ["Chamfer"]
+
+POINTS = 500
+"""Points of a target."""
+
+FAR = 1e9
+"""Squared distance of the nearest particle before any was looked at [domain units^2]."""
+
+EQUAL = 1.0 + 1e-6
+"""Squared distances within this factor of the least count as the least: its own may round otherwise when it
+is computed again."""
+
+
+class Chamfer(ParticleTerm):
+    """Chamfer distance of squared lengths, and its gradient."""
+
+    name = "chamfer"
+    label = "mean squared distances of particles and points of the target to the nearest of the other"
+    unit = "domain units^2"
+
+    def attach(self, sim) -> None:
+        """Allocate points, and the squared distances of the nearest particles from them."""
+        super().attach(sim)
+        shape = (sim.batch, POINTS)
+        self.points = sim.share(ti.Vector.field(3, sim.real, shape=shape))
+        self.nearest = sim.share(ti.field(sim.real, shape=shape))
+        self.found = ti.field(sim.real, shape=shape)
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Choose the points."""
+        made = {own.tobytes(): own for own in mass}
+        points = {key: lumps(own, POINTS) for key, own in made.items()}
+        self.sim.write(self.points, np.stack([points[own.tobytes()] for own in mass]))
+        self.sim.write(self.nearest, np.full((self.sim.batch, POINTS), FAR))
+
+    @ti.func
+    def measure(self, e, x, v):
+        """The particle's share; notes where it is the nearest one."""
+        least = ti.cast(FAR, self.sim.real)
+        for k in range(POINTS):
+            d = (x - self.points[e, k]).norm_sqr()
+            least = ti.min(least, d)
+            if d < self.nearest[e, k]:
+                ti.atomic_min(self.nearest[e, k], d)
+        return least / self.sim.particles
+
+    @ti.func
+    def finish(self, e):
+        """The points' share."""
+        total = ti.cast(0.0, ti.f64)
+        for k in range(POINTS):
+            total += ti.cast(self.nearest[e, k], ti.f64)
+            self.found[e, k] = self.nearest[e, k]
+            self.nearest[e, k] = FAR
+        return total / POINTS
+
+    @ti.func
+    def gradient(self, e, x, v):
+        """Towards the nearest point, and those to which the particle is the nearest."""
+        least = ti.cast(FAR, self.sim.real)
+        way = 0.0 * x
+        x_bar = 0.0 * x
+        for k in range(POINTS):
+            away = x - self.points[e, k]
+            d = away.norm_sqr()
+            if d < least:
+                least = d
+                way = away
+            if d <= EQUAL * self.found[e, k]:
+                x_bar += (2.0 / POINTS) * away
+        return x_bar + (2.0 / self.sim.particles) * way, 0.0 * v
