@@ -115,7 +115,12 @@ def test_distances_are_means_of_the_runs_that_have_them(tmp_path: Path) -> None:
         synthetic.save(result)
     (table,) = distances(gather(tmp_path))
     (row,) = table.cells.to_dict("records")
-    assert (row["task"], row["distance"], row["Adam"], row["GD"]) == ("Rope", "Chamfer", "0.150 ± 0.050", NOTHING)
+    assert (row["task"], row["distance"], row["Adam"], row["GD"]) == (
+        "Rope",
+        "Chamfer",
+        "0.150 ± 0.050",
+        NOTHING,
+    )
 
 
 def test_differences_and_rows_per_configuration(folder: Path) -> None:

@@ -100,6 +100,39 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
     assert alone[0].spec.max_episode_steps == HORIZON
 
 
+def test_stages_ask_for_one_target_after_the_other() -> None:
+    """The first target is beside the ball: the second environment reaches it in a step."""
+    near = "{recipe: bodies, bodies: {ball: {shape: sphere, center: [0.68, 0.56, 0.75], size: [0.1]}}}"
+    overrides = [*COARSE, "sim.horizon=4"]
+    options = {"autoreset_mode": "Disabled", "success_score": 0.02, "observe": ["state", "target_mass"]}
+    staged = [*overrides, f"+task.stages=[{near}]"]
+    env = plab.make_vec("Move", num_envs=2, overrides=staged, **options)
+    plain = plab.make_vec("Move", num_envs=2, overrides=overrides, **options)
+    actions = np.array([[0.0] * 6, [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    (first, info), (last, _) = env.reset(seed=0), plain.reset()
+    assert info["stage"].tolist() == [0, 0] and not np.array_equal(first["target_mass"], last["target_mass"])
+    steps, whole = [env.step(actions), env.step(actions)], [plain.step(actions)[4] for _ in range(2)]
+    seen, rewards, *_, info = steps[0]
+    assert info["stage"].tolist() == [0, 1] and not info["success"].any()
+    assert info["stage_scores"][1, 0] >= 0.02 > info["stage_scores"][0, 0]
+    np.testing.assert_array_equal(seen["target_mass"], [first["target_mass"][0], last["target_mass"][1]])
+    # What the first stage has earned stays.
+    gained = whole[0]["loss"][1] - whole[1]["loss"][1]
+    assert rewards[1] > 0.0 and steps[1][1][1] == pytest.approx(rewards[1] + gained, rel=1e-6)
+    kept = env.get_state()
+    third = env.step(actions)
+    env.reset(options={"reset_mask": np.array([False, True])})
+    assert env.step(actions)[4]["stage"].tolist() == [0, 1]
+    env.set_state(kept)
+    assert data_equivalence(env.step(actions), third, exact=True)
+    again, info = env.reset()
+    assert data_equivalence(again, first, exact=True) and not info["stage_scores"].any()
+    with pytest.raises(ValueError, match=r"task.stages: 0"):
+        plab.make("Move", overrides=["+task.stages=[{recipe: bodys}]"])
+    env.close()
+    plain.close()
+
+
 def test_goals_agree_with_hindsight() -> None:
     names = ["state", "mass", "target_mass", "target_points"]
     ranges = {"target": {"bodies": {"ball": {"center": [[0.4, 0.3, 0.4], [0.7, 0.5, 0.75]]}}}}

@@ -221,7 +221,7 @@ _NO_EFFECT = {
     "sim": ("memory_mb",),
     # Name and score change no number, and the contact term is that of the method.
     "protocol": ("name", "score", "contact"),
-    "task": ("release", "cameras"),
+    "task": ("release", "cameras", "stages"),
 }
 """Configuration keys by section that cannot change a result, hence are left out of the hash."""
 
@@ -230,11 +230,11 @@ def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
     """Return a :class:`Config`, or a mapping, as plain dictionaries and lists.
 
     Optional keys of bodies that have no value, such as ``file``, are left out, and so are ``kinematics``,
-    ``randomize`` and ``cameras`` of a task.
+    ``randomize``, ``cameras`` and ``stages`` of a task.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
-    for key in ("kinematics", "randomize", "cameras"):
-        if lookup(plain, f"task.{key}") in (None, {}):
+    for key in ("kinematics", "randomize", "cameras", "stages"):
+        if lookup(plain, f"task.{key}") in (None, {}, []):
             del plain["task"][key]
     bodies = lookup(plain, "task.bodies")
     for body in bodies.values() if isinstance(bodies, dict) else ():

@@ -275,6 +275,8 @@ class TaskConfig(ranges.Section):
         randomize: Ranges of what every episode of an environment draws, see :mod:`plab.config.draws`; empty
             where all episodes are alike.
         cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
+        stages: Targets, as ``target``, that environments ask for one after the other before ``target``; runs
+            know ``target`` alone.
         release: Numbers of the PlasticineLab release where they differ, merged over this structure, variants
             included, by ``protocol.numbers=release``. Empty in a run's configuration.
     """
@@ -292,6 +294,7 @@ class TaskConfig(ranges.Section):
     random: dict[str, Any] = field(default_factory=dict)
     randomize: dict[str, Any] = field(default_factory=dict)
     cameras: dict[str, Any] = field(default_factory=dict)
+    stages: list[dict[str, Any]] = field(default_factory=list)
     release: dict[str, Any] = field(default_factory=dict)
     kinematics: KinematicsConfig | None = None
 
@@ -305,10 +308,11 @@ class TaskConfig(ranges.Section):
                 item.check(f"{path}.{group}.{name}")
         if self.kinematics is not None:
             self.kinematics.check(f"{path}.kinematics")
-        try:
-            make_recipe(self.target)
-        except TargetError as error:
-            raise ConfigError(f"{path}.{error}") from None
+        for place, target in [("", self.target), *((f"stages: {k}: ", t) for k, t in enumerate(self.stages))]:
+            try:
+                make_recipe(target)
+            except TargetError as error:
+                raise ConfigError(f"{path}.{place}{error}") from None
         ranges_of(self)
         for name, camera in self.cameras.items():
             try:

@@ -22,6 +22,7 @@ from plab.config.selection import OBSERVED
 from plab.config.words import prepared
 from plab.envs.draws import Draws
 from plab.envs.observations import Observer, Sensors, mapped, spaces
+from plab.envs.stages import Stages, staged
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of, make_simulator
 from plab.scenes import CONTACTS, Camera
@@ -105,7 +106,7 @@ def make_batch(
         overrides_per_env=overrides_per_env,
         config_dir=config_dir,
     )
-    return EpisodeBatch(cfgs, **options)
+    return EpisodeBatch(cfgs, **{"stages": True} | options)
 
 
 def compose_configs(
@@ -209,6 +210,7 @@ class EpisodeState:
         over: Which episodes have ended by a success or at the horizon, shape [batch].
         values: What was drawn for each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
+        stages: Numbers, earnings and scores of the stages; empty where there are none.
     """
 
     steps: np.ndarray | None
@@ -220,6 +222,7 @@ class EpisodeState:
     over: np.ndarray
     values: tuple[Values, ...]
     starts: np.ndarray
+    stages: tuple[np.ndarray, ...] = ()
 
 
 class EpisodeBatch:
@@ -246,6 +249,7 @@ class EpisodeBatch:
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
         randomize: Mapping[str, Any] | None = None,
         impulses: bool = False,
+        stages: bool = False,
         success_score: float = 0.9,
         terminate_on_success: bool = False,
         render_size: tuple[int, int] = (480, 360),
@@ -262,6 +266,7 @@ class EpisodeBatch:
             randomize: Ranges of what each episode draws, in place of the tasks' own, see
                 :mod:`plab.config.draws`; empty: nothing.
             impulses: Whether ``info`` has the impulses on the manipulators; so it has if they are observed.
+            stages: Whether episodes ask for the targets of ``task.stages`` first; :func:`make_batch` sets it.
             success_score: Score from which on a state is a success.
             terminate_on_success: Whether a success ends the episode.
             render_size: Width and height of pictures [pixels].
@@ -279,7 +284,7 @@ class EpisodeBatch:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
         _require_alike(cfgs)
         self._randomize, self._success_score = randomize, success_score
-        self._terminates = terminate_on_success
+        self._terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)
         self._sums_impulses = impulses or "impulses" in observe
         problem = Problem(cfgs, make_simulator(cfgs, impulses=self._sums_impulses))
@@ -315,7 +320,7 @@ class EpisodeBatch:
         cfgs = self._ranged(cfgs)
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
-        if self.draws.changed or kinds_of(cfgs) != kinds_of(self.configs):
+        if self.draws.changed or self._stages or kinds_of(cfgs) != kinds_of(self.configs):
             # After an error half way, the batch belongs to no configurations.
             self.configs: tuple[Config, ...] = ()
             simulator.set_scenes(scenes)
@@ -340,10 +345,15 @@ class EpisodeBatch:
         self.configs = tuple(cfgs)
         self.draws = Draws(cfgs, problem)
         self._observer = Observer(problem, cfgs[0])
+        self._stages = Stages(cfgs, problem) if self._goes_by_stages and any(map(staged, cfgs)) else None
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
         """Observe the initial states; no episode has started."""
+        if self._stages:
+            self._stages.begin(range(self.size), self.problem)
+            self.problem.refresh()
+            self._observer = Observer(self.problem, self.configs[0])
         self._steps: np.ndarray | None = None
         self._over = np.zeros(self.size, bool)
         # Of environments with the same configuration, each has draws of its own.
@@ -426,6 +436,8 @@ class EpisodeBatch:
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = [(*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)]
         changed = self.draws.redraw(rows, entropy, options or {})
+        if self._stages:
+            changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers
         if self._steps is None:
             self._steps = np.zeros(self.size, int)
@@ -504,6 +516,9 @@ class EpisodeBatch:
         observation, *measured = _copies(self._last)
         info = self._info(*measured)
         reward = self._initial_loss.like(actions) - info["loss"]
+        if self._stages:
+            reward = self._go_on(self._stages, reward, info, actions)
+            observation = mapped(_copy, self._last[0])
         terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
         self._over = terminated | truncated
@@ -511,6 +526,32 @@ class EpisodeBatch:
         if self.listener is not None:
             self.listener(actions, done)
         return done
+
+    def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
+        """Let environments that have reached their stage's target go on to the next, where a step has ended;
+        returns the rewards."""
+        reward = reward + Constants(stages.earned.copy()).like(like)
+        stages.note(_on_host(info["score"]))
+        reached = _on_host(info["score"]) >= self._success_score
+        reached[list(self._failures)] = False
+        rows = np.flatnonzero(reached & ~stages.last)
+        if rows.size:
+            stages.earned[rows] = _on_host(reward)[rows]
+            stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
+            terms, iou, *others = self._measured(like)
+            self._note_starts(rows, terms, iou)
+            before, self._last = self._last, (self._observe(like), terms, iou, *others)
+            self._keep(before, list(self._failures))
+        info |= self._stage_info(info["score"])
+        return reward
+
+    def _stage_info(self, like: Array) -> dict[str, Any]:
+        """Return the number of each environment's stage, and the score reached in each stage."""
+        if self._stages is None:
+            return {}
+        known = {"stage": self._stages.current, "stage_scores": self._stages.scores}
+        device = on_device(like)
+        return {key: like.new_tensor(value) if device else value.copy() for key, value in known.items()}
 
     @_alone
     def get_state(self) -> EpisodeState:
@@ -534,6 +575,7 @@ class EpisodeBatch:
             self._over.copy(),
             tuple(self.draws.values),
             np.array(starts),
+            self._stages.saved() if self._stages else (),
         )
 
     @_alone
@@ -548,7 +590,10 @@ class EpisodeBatch:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         self._simulator.set_state(state.simulation)
-        if self.draws.put(dict(enumerate(state.values))):
+        changed = self.draws.put(dict(enumerate(state.values)))
+        if self._stages:
+            self._stages.restore(state.stages, self.problem)
+        if changed or self._stages:
             self._changes = self._simulator.changes
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
@@ -680,14 +725,17 @@ class EpisodeBatch:
 
     def _info(self, terms: Array, iou: Array, impulses: Array = None) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
-        drawn = self.draws.info()
+        drawn, success = self.draws.info(), score >= self._success_score
+        if self._stages:
+            success = success & (Constants(self._stages.last).like(iou) > 0.0)
         return {
             "loss": self.problem.loss_of(terms),
             **{f"loss_{name}": terms[:, k] for k, name in enumerate(self.problem.term_names)},
             "iou": iou,
             "score": score,
             "score_printed": printed,
-            "success": score >= self._success_score,
+            "success": success,
+            **self._stage_info(iou),
             **({} if impulses is None else {"impulses": impulses}),
             **({"randomized": drawn} if drawn else {}),
         }
