@@ -57,7 +57,7 @@ PYTHON = {
     "simulator": (
         "Simulator",
         "The simulator, usable without configurations.",
-        ("plab.sim.simulator", "plab.sim.tape.Recording", "plab.sim.state"),
+        ("plab.sim.simulator", "plab.sim.tape.RecordedStates", "plab.sim.state"),
     ),
     "methods": (
         "Methods",

@@ -21,7 +21,7 @@ from plab.sim.state import require_none
 
 if TYPE_CHECKING:
     from plab.problem import Problem
-    from plab.sim import Recording, Simulator, State
+    from plab.sim import RecordedStates, Simulator, State
 
 __all__ = ["States", "Stretch", "policy_gradient", "rollout", "simulate"]
 
@@ -173,7 +173,7 @@ class _States(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: torch.Tensor | None) -> tuple[Any, ...]:
-        recording: Recording = ctx.recording
+        recording: RecordedStates = ctx.recording
         held = {
             name: _given(bar, ctx.simulator)
             for name, bar in zip(States._fields, bars, strict=True)

@@ -5,12 +5,12 @@ import plab.sim.compiler  # noqa: F401
 from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
 from plab.sim.state import Measures, Rollout, State
-from plab.sim.tape import Recording
+from plab.sim.tape import RecordedStates
 
 __all__ = [
     "DeviceError",
     "Measures",
-    "Recording",
+    "RecordedStates",
     "Rollout",
     "SimulationError",
     "Simulator",

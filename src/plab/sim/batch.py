@@ -22,11 +22,11 @@ SHARED = (
     "digits_convention",
     "floor_stencil",
 )
-"""Properties that scenes of one simulator share, beside their manipulators' shapes."""
+"""Properties that must agree between the scenes of a simulator, besides the shapes of manipulators."""
 
 
 def scene_kind(scene: Scene) -> tuple[Any, ...]:
-    """Return a key that is equal for scenes that one simulator can hold, in sequence or in a batch."""
+    """Return a key that is equal for scenes that can share a simulator, in sequence or in a batch."""
     shared = (getattr(scene, name) for name in SHARED)
     return (*shared, *(tool.shape for tool in scene.manipulators), _topology(scene))
 
@@ -36,8 +36,8 @@ def _topology(scene: Scene) -> tuple[Any, ...]:
 
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
-    """Raise SceneError if scenes cannot be simulated, or do not fit together in one simulator, that of
-    ``like`` if there is one."""
+    """Raise SceneError if scenes cannot be simulated or cannot share a simulator, also with the scene
+    ``like`` if given."""
     if isinstance(scenes, Scene):
         raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
     if not scenes:
@@ -61,8 +61,8 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
 
 
 def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
-    """Poses in which the scenes' manipulators start, as in :class:`plab.sim.State`, shape [batch,
-    manipulator, 8]."""
+    """Return the initial poses of the manipulators, shape [batch, manipulator, 8]; see
+    :class:`plab.sim.State`."""
     turn = list if scenes[0].digits_convention == "release" else _unit
     return np.array(
         [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes], dtype=np.float64
@@ -84,11 +84,11 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
 
     Args:
         scenes: One scene per environment.
-        given: Values by the parameters' names, one for all scenes or shape [batch]. Where bodies have
-            materials of their own, they are those of all, or of each if the shape is [batch, body].
+        given: Values by parameter name, scalar or of shape [batch]; also [batch, body] if bodies have their
+            own materials.
 
     Raises:
-        SceneError: If bodies of one material are given one each, or no law has such a parameter.
+        SceneError: If values per body are given for a single material, or no law has such a parameter.
     """
     counts = len(scenes), len(scenes[0].bodies)
     keys = material_keys(scenes[0])
@@ -117,7 +117,7 @@ def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
         own = {key: value for key, value in zip(values, numbers, strict=True) if key in material.kind.keys}
         fields: dict[str, Any] = {key: value for key, value in own.items() if key in MATERIAL_KEYS}
         if scene.material_count == 1:
-            # The one material is the scene's, and no body's own.
+            # A single material belongs to the scene, not to a body.
             fields = dict.fromkeys(fields)
         others = {key: value for key, value in own.items() if key not in MATERIAL_KEYS}
         bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **others}))
@@ -125,8 +125,8 @@ def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
 
 
 def parameter_gradient(material: Material, bars: Sequence[float], keys: Sequence[str]) -> list[float]:
-    """Return derivatives by parameters from those by the coefficients of a material's law, shape
-    [coefficient]; 0 for parameters that it has not."""
+    """Convert derivatives with respect to the coefficients of a material's law, shape [coefficient], to
+    derivatives with respect to parameters; 0 for parameters that the law does not have."""
     law = material.kind
     own = dict(zip(law.keys, law.parameter_gradient(material.values, bars[: law.size]), strict=True))
     return [own.get(key, 0.0) for key in keys]

@@ -1,6 +1,7 @@
-"""Memory of a simulation: estimates before anything is allocated, limits of indices, and bytes held.
+"""Memory of a simulation: estimates before allocation, limits of indices, and allocated bytes.
 
-Estimates are lower bounds. They refuse scenes that cannot fit, and size batches and checkpoints.
+Estimates are lower bounds, used to reject scenes that cannot fit and to choose the sizes of batches and
+checkpoints.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from plab.sim.runtime import cuda_driver
 from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
-"""Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
+"""Largest size of an array of states. Taichi uses 32-bit indices; on the CPU see
 :data:`plab.sim.storage.STATE_MASK`."""
 
 BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
@@ -27,20 +28,20 @@ BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
 def environment_bytes(
     scene: Scene, precision: str, device: str, *, states: int = 3, gradient: bool = False
 ) -> int:
-    """Return how much memory one environment takes at least [bytes].
+    """Return a lower bound for the memory of one environment [bytes].
 
     Args:
         scene: The scene.
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
         states: Particle states that are kept.
-        gradient: Whether adjoints of the grids are held, too.
+        gradient: Whether to include adjoints of the grids.
     """
     places = -(-scene.particle_count // LANES[device]) * LANES[device]
     # Momentum by chunk and velocity, four numbers each; target mass and distance.
     grids = _nodes(scene) * 4 * (_chunks(device) + 1) * (2 if gradient else 1) + 2 * scene.grid_size**3
     frames = scene.substeps * len(scene.manipulators)
-    # Beside its states a particle has 9 numbers of stress; a pose is in float64.
+    # Each particle also has 9 numbers of stress; poses are float64.
     return (places * (states * STATE + 9) + grids + 25 * frames) * BYTES[precision] + 64 * frames
 
 
@@ -53,8 +54,8 @@ def _nodes(scene: Scene) -> int:
 
 
 def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None:
-    """Raise SceneError unless scenes that are alike in size fit into one simulator; the message says how many
-    would."""
+    """Raise SceneError unless scenes of equal size fit into one simulator; the message states the largest
+    number."""
     count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
     numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
     if not numbered:
@@ -72,30 +73,30 @@ def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None
 
 
 def most_environments(scene: Scene, precision: str, device: str) -> int:
-    """Return how many environments half of a device's memory has room for, without a gradient; at least 1."""
+    """Return the number of environments that fit into half of a device's memory without a gradient; at least
+    1."""
     room = min(device_bytes(device) / 2, 1e15)
     return max(1, int(room // environment_bytes(scene, precision, device)))
 
 
 def kept_states(steps: int, slots_per_step: int, length: int, reach: int) -> int:
-    """Return how many states a gradient keeps if every ``length`` environment steps are one segment.
+    """Return the number of states stored for a gradient with segments of ``length`` environment steps.
 
-    All states of one segment are kept, in arrays of ``reach`` steps, each with one more at its start, the
-    first one of every segment, and one more.
+    These are all states of one segment, in arrays of ``reach`` steps with an additional state at the start,
+    the first state of every other segment, and one more.
     """
     segments, arrays = -(-steps // length), -(-length // reach)
     return length * slots_per_step + arrays + 1 + (segments if segments > 1 else 0)
 
 
 def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> int:
-    """Return how many environments a simulator should have at most for gradients of whole episodes.
+    """Return the largest useful number of environments for gradients of whole episodes.
 
-    On the CPU as many as need not compute any state twice: more would run no faster. On CUDA as many as there
-    is memory for if few states are kept: what it costs to compute the others again is less than what a full
-    device gains.
+    On the CPU, all states should be stored, because larger batches are not faster. On CUDA, few states are
+    stored: filling the device gains more than recomputing the states costs.
 
     Args:
-        scene: One of the scenes, which are alike in size.
+        scene: One of the scenes, which have equal sizes.
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
         memory_mb: Memory for states, grids and targets [MB].
@@ -103,12 +104,12 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     Returns:
         Number of environments, at least 1.
     """
-    # On CUDA a step's start may be kept in two orders of the particles.
+    # On CUDA the start of a step may be stored in two particle orders.
     slots_per_step = scene.substeps + (0 if device == "cpu" else 1)
     if device == "cpu":
         kept = kept_states(scene.horizon, slots_per_step, scene.horizon, scene.horizon)
     else:
-        # No array is longer than that of one step; there is one array for the segments.
+        # No array is longer than one step; one array stores the starts of segments.
         lengths = range(-(-scene.horizon // (slots_per_step + 1)), scene.horizon + 1)
         kept = min(kept_states(scene.horizon, slots_per_step, length, 1) for length in lengths)
     # The current and the initial state, their adjoints, orders, and room to sort: less than seven states.
@@ -130,22 +131,22 @@ def segment_length(
     held: int,
     memory_mb: float,
 ) -> int:
-    """Return how many environment steps of a gradient's T ``steps`` are one segment.
+    """Return the number of environment steps per segment for a gradient over T ``steps``.
 
     Args:
         steps: Environment steps T.
-        slots_per_step: States that are kept of a step.
-        reach: Steps whose states fit into one array.
-        segments_max: States that fit into one array.
-        slot_bytes: Bytes of a state of all environments.
-        held: Bytes of everything else.
-        memory_mb: Budget for all of it [MB].
+        slots_per_step: States stored per step.
+        reach: Number of steps whose states fit into one array.
+        segments_max: Number of states that fit into one array.
+        slot_bytes: Size of a state of all environments [bytes].
+        held: Memory of everything else [bytes].
+        memory_mb: Total memory budget [MB].
 
     Returns:
-        The most that fit into the budget, or fewer if as many segments do; all have about this length.
+        The largest length that fits into the budget, reduced to segments of about equal length.
 
     Raises:
-        MemoryError: If no length fits into the budget, or none into arrays that Taichi can address.
+        MemoryError: If no length fits into the budget or into arrays that Taichi can address.
     """
     lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
     if not lengths:
@@ -167,7 +168,7 @@ def segment_length(
 
 
 def held_bytes(*holders: object) -> int:
-    """Return the bytes of all fields and arrays among the attributes of objects, also in lists."""
+    """Return the memory of all fields and arrays among the attributes of objects, including lists [bytes]."""
     values = [value for holder in holders for value in vars(holder).values()]
     values += [part for value in values if isinstance(value, list) for part in value]
     held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
@@ -183,7 +184,7 @@ def _array_bytes(data: ti.Field | ti.Ndarray) -> int:
 
 
 def device_bytes(device: str) -> float:
-    """Return the memory of a device that this process may use [bytes]; infinite where it is unknown."""
+    """Return the memory of a device available to this process [bytes]; infinite if unknown."""
     if device == "cuda":
         total, driver = ctypes.c_size_t(0), cuda_driver()
         known = driver is not None and driver.cuDeviceTotalMem_v2(ctypes.byref(total), 0) == 0
@@ -191,7 +192,7 @@ def device_bytes(device: str) -> float:
     limits = [math.inf]
     if hasattr(os, "sysconf"):
         limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
-    # A container's or a cluster job's; there may be no such file, or it may say "max".
+    # Limit of a container or a cluster job; the file may be missing or contain "max".
     for file in ("memory.max", "memory/memory.limit_in_bytes"):
         try:
             limits.append(float((Path("/sys/fs/cgroup") / file).read_text(encoding="ascii")))

@@ -1,4 +1,4 @@
-"""Simulator of a batch of environments of one kind: settings, steps, rollouts and their gradients."""
+"""Simulator of a batch of environments: settings, steps, rollouts and their gradients."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from plab.sim.state import (
     require_none,
     rest_state,
 )
-from plab.sim.tape import ClosedLoop, Recording, Tape
+from plab.sim.tape import ClosedLoop, RecordedStates, Tape
 from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
 
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 class Simulator:
     """Differentiable elastoplastic MLS-MPM for a batch of environments.
 
-    All environments share the numbers of particles and manipulators, the manipulators' shapes, grid and time
-    step; positions, sizes, material and targets may differ. One process has one device and precision at a
-    time.
+    All environments share the number of particles, the number and shapes of manipulators, the grid and the
+    time step; positions, sizes, materials and targets may differ. A process uses one device and one precision
+    at a time.
 
     Attributes:
         scenes: One scene per environment.
@@ -82,25 +82,24 @@ class Simulator:
 
         Args:
             scenes: One scene per environment.
-            terms: Terms of the loss, as :func:`plab.losses.make_terms` makes them; those of weight 0 are left
-                out.
+            terms: Terms of the loss from :func:`plab.losses.make_terms`; terms of weight 0 are left out.
             precision: ``float32`` or ``float64``.
             device: ``cpu`` or ``cuda``.
-            memory_mb: Budget for all fields and arrays with a gradient [MB]; fewer states are kept and more
-                recomputed to stay in it.
-            threads: CPU threads; all that the process may use if None. Results do not depend on it.
+            memory_mb: Memory budget for all fields and arrays with a gradient [MB]. If states do not fit,
+                they are recomputed.
+            threads: CPU threads; default: all available. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             full_gradient: Whether a rollout's gradient includes those with respect to the initial state
                 (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
-            deterministic: Whether CUDA gives the same bits in every run and batch, see
-                :mod:`plab.sim.cuda_sums`; the CPU does in any case.
+            deterministic: Whether CUDA is bitwise reproducible, independent of the batch, see
+                :mod:`plab.sim.cuda_sums`; the CPU always is.
             impulses: Whether :meth:`step` sums the impulses on the manipulators (:meth:`impulses`).
-            _singular_values: Whether to decompose every strain into singular values, also where series
-                serve; for measurements of accuracy.
+            _singular_values: Whether to use singular values for all strains instead of series for small ones;
+                for accuracy benchmarks.
 
         Raises:
-            SceneError: If a scene cannot be simulated or the scenes do not fit together.
-            DeviceError: If CUDA was asked for and is not there.
+            SceneError: If a scene cannot be simulated or the scenes cannot share a simulator.
+            DeviceError: If CUDA is not available.
             ValueError: If device or precision are unknown.
         """
         require_alike(scenes)
@@ -137,7 +136,7 @@ class Simulator:
         self._joints: Any = None
         self._initial_joints: np.ndarray | None = None
         self._start_from(particles)
-        # Changes with all that a rollout's gradient depends on.
+        # Incremented by every change that affects the gradient of a rollout.
         self._version = 0
         self.changes = 0
         self.set_contact("soft")
@@ -145,20 +144,20 @@ class Simulator:
         self.reset()
 
     def memory_bytes(self) -> int:
-        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
-        its compiled kernels and what is on the way to or from the host."""
+        """Memory of all fields and arrays of the simulator on its device [bytes], without Taichi itself,
+        compiled kernels and transfers to or from the host."""
         engine = self._engine
         return held_bytes(self, engine, *engine.terms, self._particles, self._particles.order, self._tape)
 
     # -- settings -----------------------------------------------------------------------------------
 
     def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
-        """Choose the contact model; nothing is compiled anew.
+        """Set the contact model, without recompilation.
 
         Args:
-            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one for all
-                environments, or one for each.
-            softness: Decay rate of the soft model [1 / domain unit]; one for all, or one for each.
+            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one value, or one per
+                environment.
+            softness: Decay rate of the soft model [1 / domain unit]; one value, or one per environment.
         """
         models = np.broadcast_to(model, self.batch)
         decay = np.broadcast_to(np.asarray(softness, float), self.batch)
@@ -171,10 +170,10 @@ class Simulator:
         self._engine.write(self._engine.alpha, np.where(models == "soft", decay, 0.0))
 
     def set_weights(self, weights: Mapping[str, float]) -> None:
-        """Set weights of terms in the trajectory loss and its gradient; nothing is compiled anew.
+        """Set the weights of loss terms in the trajectory loss and its gradient, without recompilation.
 
         Args:
-            weights: By the terms' names.
+            weights: Weights by name of the term.
 
         Raises:
             ValueError: If the simulator was built without a term.
@@ -189,9 +188,9 @@ class Simulator:
         self._engine.write(self._engine.term_weights, held)
 
     def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
-        """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
+        """Replace all scenes by scenes of the same kind and reset, without recompilation.
 
-        Contact model, weights and targets stay.
+        Contact model, weights and targets are unchanged.
 
         Args:
             scenes: One scene per environment.
@@ -212,22 +211,21 @@ class Simulator:
 
     @property
     def material_keys(self) -> tuple[str, ...]:
-        """Names of the material's parameters, in the order in which :meth:`material_gradient` has them."""
+        """Names of the material's parameters, in the order of :meth:`material_gradient`."""
         return material_keys(self.scenes[0])
 
     def set_material(self, *values: ArrayLike | None, **named: ArrayLike | None) -> None:
-        """Change the material; nothing is compiled anew.
+        """Set material parameters, without recompilation.
 
         Args:
-            *values: Values of the parameters, in the order of :attr:`material_keys`; as they are if None.
-                Each is one for all environments, or has the shape [batch]. It is that of all bodies whose law
-                has such a parameter; with shape [batch, body], where bodies have materials of their own, of
-                each.
-            **named: The same by the parameters' names.
+            *values: Parameter values in the order of :attr:`material_keys`; None leaves a parameter
+                unchanged. Each is a scalar or has shape [batch], for all bodies whose law has the parameter;
+                if bodies have their own materials, also shape [batch, body].
+            **named: Parameter values by name.
 
         Raises:
-            SceneError: If a scene could not be simulated with it, or a simulator of one material is given
-                one for each body; nothing is changed then.
+            SceneError: If a scene cannot be simulated with these values, or values per body are given for a
+                single material; nothing is changed in these cases.
         """
         self._require_runtime()
         given = {**dict(zip(self.material_keys, values, strict=False)), **named}
@@ -263,18 +261,18 @@ class Simulator:
             term.set_target(held["mass"].astype(np.float64), held["sdf"])
 
     def change_scenes(self, scenes: Sequence[Scene], particles: Mapping[int, np.ndarray]) -> None:
-        """Replace all scenes by others of the same kind between episodes; nothing is compiled anew.
+        """Replace all scenes by scenes of the same kind between episodes, without recompilation.
 
-        Current states, targets, contact model and weights stay. Environments keep their initial particles,
-        unless they are given others.
+        Current states, targets, contact model and weights are unchanged. Environments keep their initial
+        particles unless new ones are given.
 
         Args:
             scenes: One scene per environment.
-            particles: Initial positions of some environments, [particle, 3] each.
+            particles: Initial positions by environment, each of shape [particle, 3].
 
         Raises:
             SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
-            ValueError: If positions do not fit.
+            ValueError: If positions have a wrong shape.
         """
         self._require_runtime()
         require_alike(scenes, self.scenes[0])
@@ -291,7 +289,7 @@ class Simulator:
     # -- forward ------------------------------------------------------------------------------------
 
     def reset(self, environments: Sequence[int] | None = None) -> None:
-        """Put all environments into their initial states, or some of them."""
+        """Reset all or some environments to their initial states."""
         self._require_runtime()
         self._version += 1
         if environments is not None:
@@ -321,18 +319,19 @@ class Simulator:
         """Advance all environments by one environment step, without keeping history.
 
         Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1]. A CUDA tensor is taken as it is.
-            check: Whether to wait for the step and look for faults. If not, the next :meth:`measure` does.
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. CUDA tensors stay on the device.
+            check: Whether to wait for the step and check for divergence. If False, the next :meth:`measure`
+                does.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            SimulationError: If the state stops being finite and ``check`` is set.
+            SimulationError: If the simulation diverges and ``check`` is True.
         """
         self._require_runtime()
         self._version += 1
         through = (lambda given: self._follow(given, False).twists) if self._map else None
         array = step_actions(actions, self.batch, self.action_dim, self.device, through)
-        # What a rollout has left in the sums is none of this step's.
+        # Discard the impulses of earlier rollouts.
         self._take_impulses()
         self._particles.step(self._pose, array)
         self._take_impulses()
@@ -343,10 +342,11 @@ class Simulator:
             require_none(broken_states(faults, self.substeps, self._taken))
 
     def measure(self, like: torch.Tensor | None = None) -> Measures:
-        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type.
+        """Return loss terms and soft IoU of the current state; CUDA tensors of the same type if ``like`` is
+        one.
 
         Raises:
-            SimulationError: If the last step, which was not to look for faults, broke the state.
+            SimulationError: If the last step, made with ``check=False``, has diverged.
         """
         self._require_runtime()
         if on_device(like):
@@ -362,11 +362,11 @@ class Simulator:
         return self._judged(values)
 
     def losses(self) -> np.ndarray:
-        """Unweighted loss terms of the current state, shape [batch, term]."""
+        """Return the unweighted loss terms of the current state, shape [batch, term]."""
         return self.measure().terms
 
     def mass_tensor(self) -> np.ndarray:
-        """Mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
+        """Return the mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
         self._require_runtime()
         self._particles.losses(self._scratch_terms, 0)
         n = self.grid_size
@@ -377,20 +377,20 @@ class Simulator:
     # -- state --------------------------------------------------------------------------------------
 
     def state(self) -> State:
-        """The current state, particles in the order in which they were given."""
+        """Return the current state, with particles in their original order."""
         poses = cast(np.ndarray, self.poses())
         state = self._particles.unpack(self._particles.current.to_numpy(), poses)
         joints = self._joints.cpu().numpy() if on_device(self._joints) else self._joints
         return state if joints is None else replace(state, joints=np.array(joints, np.float64))
 
     def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
-        """Position and velocity of every ``stride``-th particle, in the order in which they were given.
+        """Return position and velocity of every ``stride``-th particle, in the original order.
 
-        Only these are copied from the device.
+        Only these particles are copied from the device.
 
         Args:
-            stride: Distance of the observed particles' numbers, at least 1.
-            like: Given a CUDA tensor, the result is one too, of its type, and nothing is copied to the host.
+            stride: Stride between the numbers of observed particles, at least 1.
+            like: If a CUDA tensor, the result is a CUDA tensor of the same type, without a copy to the host.
 
         Returns:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
@@ -401,7 +401,7 @@ class Simulator:
     def _observe(
         self, state: ti.Ndarray, slot: int, stride: int, like: torch.Tensor | None
     ) -> np.ndarray | torch.Tensor:
-        """:meth:`observe` for a time slot of an array, whose particles are in the present order."""
+        """As :meth:`observe`, for a time slot of an array with particles in the current order."""
         count = -(-self.particle_count // stride)
         size = self.batch * count * 6
 
@@ -416,16 +416,17 @@ class Simulator:
         return self._observed[stride].to_numpy().reshape(self.batch, count, 6)
 
     def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
-        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
-        tensor if ``like`` is one, of its type."""
+        """Return the poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A
+        CUDA tensor of the same type if ``like`` is one."""
         self._require_runtime()
         return numbers_of(self._pose, self._initial_poses.shape, like)
 
     def impulses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
-        """Momentum that each manipulator has taken from the body in the last :meth:`step`, 0 after a reset.
+        """Return the momentum transferred from the bodies to each manipulator in the last :meth:`step`, 0
+        after a reset.
 
         Args:
-            like: Given a CUDA tensor, the result is one too, of its type.
+            like: If a CUDA tensor, the result is a CUDA tensor of the same type.
 
         Returns:
             Impulses [mass x domain units / s], shape [batch, manipulator, 3]; divided by the duration of an
@@ -477,15 +478,14 @@ class Simulator:
         self._place(np.asarray(state.poses, np.float64))
 
     def initial_state(self) -> State:
-        """The state from which :meth:`reset` and :meth:`rollout` start."""
+        """Return the initial state of :meth:`reset` and :meth:`rollout`."""
         self._require_runtime()
         order = self._particles.order.initial
         state = self._particles.unpack(self._initial.to_numpy(), self._initial_poses.copy(), order)
         return replace(state, joints=self._initial_joints)
 
     def set_initial_state(self, state: State) -> None:
-        """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
-        :class:`State`."""
+        """Replace the initial state of :meth:`reset` and :meth:`rollout`; shapes as in :class:`State`."""
         self.set_state(state)
         self.changes += 1
         self._initial_poses, self._initial_joints = np.array(state.poses, np.float64), self._joints
@@ -496,20 +496,21 @@ class Simulator:
     def rollout(
         self, actions: np.ndarray | torch.Tensor, gradient: bool = True, *, strict: bool = True
     ) -> Rollout:
-        """Run environment steps from the initial state, and differentiate the trajectory loss.
+        """Simulate environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
-            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes
-                back are tensors of its type on the same device.
+            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. For a CUDA tensor, results are
+                tensors of the same type on the same device.
             gradient: Whether to compute the gradient.
-            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
+            strict: Whether divergence of an environment raises an error instead of adding an entry to
+                ``failures``.
 
         Returns:
             Loss terms per step and the gradient; the simulator is left in the final state.
 
         Raises:
             ValueError: If the shape is wrong, an action is not finite, or there is no loss to differentiate.
-            SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
+            SimulationError: If state, loss or gradient diverge and ``strict`` is True.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         if gradient and not self.terms:
@@ -543,16 +544,16 @@ class Simulator:
         every_step: bool = True,
         mass: bool = True,
         gradient: bool = True,
-    ) -> Recording:
-        """Run environment steps from the initial state and offer the states that they lead to, with the way
-        back: for losses that are functions of states, computed by whoever asks.
+    ) -> RecordedStates:
+        """Simulate environment steps from the initial state and return the states with their pullback, for
+        losses that the caller computes from states.
 
         Args:
-            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, the states
-                are tensors, too, of its type.
-            every_step: Whether to offer the state after every environment step, or the last one alone.
-            mass: Whether to offer mass tensors.
-            gradient: Whether :meth:`Recording.pullback` is to be called.
+            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. For a CUDA tensor, the states are
+                tensors of the same type.
+            every_step: Whether to return the state after every environment step, or only the last one.
+            mass: Whether to return mass tensors.
+            gradient: Whether :meth:`RecordedStates.pullback` will be called.
 
         Returns:
             The states; the simulator is left in the last one.
@@ -564,7 +565,7 @@ class Simulator:
         """
         array, steps, poses, plan = self._started(actions, gradient)
         drive = self._drive
-        recording = Recording(self._particles, actions, every_step, mass, steps)
+        recording = RecordedStates(self._particles, actions, every_step, mass, steps)
         self._tape.forward(array, poses, None, steps, plan, after=recording.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         self._engine.place(poses, steps, self._pose, 0)
@@ -593,21 +594,22 @@ class Simulator:
         discount: float = 1.0,
         like: torch.Tensor | None = None,
     ) -> np.ndarray | torch.Tensor:
-        """Run environment steps from the current state whose actions are chosen from what is observed, and go
-        back through the states and through what chose the actions.
+        """Simulate environment steps with actions chosen from observations, and backpropagate through the
+        states and the policy.
 
         Args:
             steps: Environment steps T.
-            choose: Called with t = 0 to T, positions and velocities as :meth:`observe` returns them, and
-                poses as :meth:`poses` does; returns the actions of step t, shape [batch, action], clipped to
-                [-1, 1]; what it returns for T is ignored.
-            react: Called with t = T to 0 and the loss's derivative by the actions of step t, shape [batch,
-                action], None for T; returns the derivatives by what was observed before step t that go
-                through these actions (for T: of a function of the last observation, which joins the loss),
-                each shaped as it, or None; what it returns for 0 is ignored.
-            stride: Distance of the observed particles' numbers.
-            discount: Step t's loss weighs so much to the power of t.
-            like: Given a CUDA tensor, everything is one too, of its type.
+            choose: Policy, called with t = 0 to T, positions and velocities as from :meth:`observe`, and
+                poses as from :meth:`poses`. Returns the actions of step t, shape [batch, action], clipped to
+                [-1, 1]; the result for T is ignored.
+            react: Pullback of the policy, called with t = T to 0 and the derivative of the loss with respect
+                to the actions of step t, shape [batch, action], None for T. Returns the derivatives with
+                respect to the observations before step t through these actions (for T: of a function of the
+                last observation that is added to the loss), in their shapes, or None; the result for 0 is
+                ignored.
+            stride: Stride between the numbers of observed particles.
+            discount: Discount factor; the loss of step t is weighted by ``discount ** t``.
+            like: If a CUDA tensor, all arrays are CUDA tensors of the same type.
 
         Returns:
             Unweighted loss terms after each step, shape [batch, T, term]; the simulator is left in the last
@@ -622,7 +624,7 @@ class Simulator:
         if not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
         self._version += 1
-        # Contact before this stretch has nothing to do with its actions.
+        # Contact before these steps does not depend on their actions.
         self._engine.write(self._engine.touched, np.zeros(self.batch))
         plan = self._tape.plan(steps, self.memory_mb)
         poses = self._pose_history(steps, cast(np.ndarray, self.poses()))
@@ -656,10 +658,10 @@ class Simulator:
         return self._judged(values).terms[1:].swapaxes(0, 1)
 
     def state_gradient(self) -> State:
-        """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
+        """Return the gradient of the last :meth:`rollout`'s loss with respect to its initial state.
 
-        The backward pass ends with it; asking for it copies it from the device. The gradient with respect to
-        a quaternion is that of the rotation matrix's polynomial, to be projected on its tangent space.
+        The backward pass computes it; this method copies it from the device. Gradients with respect to
+        quaternions are those of the rotation matrix as a polynomial; project them onto the tangent space.
 
         Raises:
             RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no rollout
@@ -670,13 +672,12 @@ class Simulator:
         return self._adjoint(self._tape.bar, self._particles.order.initial)
 
     def material_gradient(self) -> np.ndarray:
-        """Gradient of the last :meth:`rollout`'s loss with respect to the material.
+        """Return the gradient of the last :meth:`rollout`'s loss with respect to the material.
 
         Returns:
             Derivatives with respect to the parameters in :attr:`material_keys` (Young's modulus, Poisson
-            ratio and yield stress under von Mises plasticity), shape [batch, parameter]; where bodies have
-            materials of their own, with respect to those of each body, shape [batch, body, parameter], 0
-            where its law has no such parameter.
+            ratio and yield stress for von Mises plasticity), shape [batch, parameter]; if bodies have their
+            own materials, shape [batch, body, parameter], 0 for parameters that a body's law does not have.
 
         Raises:
             RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
@@ -698,10 +699,10 @@ class Simulator:
         return gradient if materials > 1 else gradient[:, 0]
 
     def loss_gradient(self) -> State:
-        """Gradient of the weighted loss of the current state by this very state: nothing is simulated.
+        """Return the gradient of the weighted loss of the current state with respect to this state, without
+        simulation.
 
-        That with respect to a quaternion is that of the rotation matrix's polynomial, as in
-        :meth:`state_gradient`.
+        Gradients with respect to quaternions are as in :meth:`state_gradient`.
         """
         self._require_runtime()
         self._engine.allocate_adjoint()
@@ -712,8 +713,8 @@ class Simulator:
         return self._adjoint(bar)
 
     def steps_before_contact(self, steps: int) -> int:
-        """Environment steps of the rollout just done, of ``steps``, before a manipulator that moves touches
-        any environment's body; 0 where the whole gradient is asked for."""
+        """Return the number of the last rollout's ``steps`` before the first contact in any environment; 0 if
+        the full gradient is requested."""
         if self._engine.full_gradient:
             return 0
         engine = self._engine
@@ -725,7 +726,8 @@ class Simulator:
     def _started(
         self, actions: np.ndarray | torch.Tensor, gradient: bool
     ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
-        """Reset; return actions, number of steps, pose history, and steps of a segment with a gradient."""
+        """Reset; return actions, number of steps, pose history, and the number of steps per segment with a
+        gradient."""
         self.reset()
         through = (lambda given: self._follow(given, gradient).twists) if self._map else None
         array = action_array(actions, self.batch, self.action_dim, self.device, through)
@@ -734,7 +736,7 @@ class Simulator:
         return array, steps, self._pose_history(steps, self._initial_poses), plan
 
     def _follow(self, actions: Any, gradient: bool = True) -> Drive:
-        """Move the joints of the articulated models by actions, shape [T, batch, A]."""
+        """Apply actions, shape [T, batch, A], to the joints of the articulated models."""
         assert self._map is not None
         self._drive = self._map.drive(self._joints, actions, gradient)
         self._joints = self._drive.joints
@@ -743,20 +745,21 @@ class Simulator:
     def _by_actions(
         self, bars: ti.Ndarray, steps: int, like: Any, drive: Drive | None
     ) -> np.ndarray | torch.Tensor:
-        """Derivatives by the actions, shape [batch, T, A], from those by the manipulators' motions."""
+        """Convert derivatives with respect to manipulator motions to derivatives with respect to actions,
+        shape [batch, T, A]."""
         bar = numbers_of(bars, (steps, self.batch, self._engine.actions_per_step), like)
         if drive is not None:
             bar = drive.pull_back(bar)[0]
         return (bar.to(like.dtype) if on_device(bar) else bar).swapaxes(0, 1)
 
     def _judged(self, values: np.ndarray | torch.Tensor) -> Measures:
-        """Loss terms and soft IoU from measures of shape [..., batch, measure]; see
+        """Convert measures of shape [..., batch, measure] to loss terms and soft IoU; see
         :class:`plab.sim.term_phases.TermPhases`."""
         terms = self._engine.terms
         peak = values[..., len(terms)]
         judges = [term.iou(values[..., k], peak) for k, term in enumerate(terms) if not term.weighted]
         iou = judges[0] if judges else peak * np.nan
-        # Those that are measured only come last.
+        # Terms without weight, which are only measured, come last.
         return Measures(values[..., : len(self.terms)], iou)
 
     def _adjoint(self, bar: ti.Ndarray, order: np.ndarray | None = None) -> State:
@@ -784,7 +787,7 @@ class Simulator:
         return checked_positions(x, self.particle_count, self.grid_size)
 
     def _place(self, poses: np.ndarray) -> None:
-        """Place the manipulators for a start, at which nothing has gone wrong."""
+        """Place the manipulators at the start of an episode and clear failures."""
         if self.manipulator_count:
             copy_numbers(self._pose, 0, np.array(poses).reshape(-1), poses.size, 1)
         self._engine.place(self._pose, 0, self._pose, 1)
@@ -799,7 +802,7 @@ class Simulator:
 
     @contextmanager
     def _kept_weights(self) -> Iterator[np.ndarray]:
-        """Put the weights of the terms back after the ``with`` block, however it ends."""
+        """Restore the weights of the terms after the ``with`` block."""
         weights = self._engine.read(self._engine.term_weights)
         try:
             yield weights
@@ -807,7 +810,7 @@ class Simulator:
             self._engine.write(self._engine.term_weights, weights)
 
     def _pose_history(self, steps: int, first: np.ndarray) -> ti.Ndarray:
-        """Room for the manipulators' poses before and after each environment step; the first ones are set."""
+        """Allocate the pose history of T environment steps; the initial poses are set."""
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         if first.size:
             copy_numbers(poses, 0, np.array(first).reshape(-1), first.size, 1)

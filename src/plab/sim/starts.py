@@ -1,4 +1,4 @@
-"""Starts of chosen environments: initial states put in place, and particles placed at rest."""
+"""Resets of selected environments to initial states, or to particles at rest."""
 
 from typing import Any
 
@@ -15,7 +15,8 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
     """Return particle positions, shape [..., particle, 3], as float64.
 
     Raises:
-        ValueError: If their number is wrong, or one is NaN or outside the grid; names it and the limits.
+        ValueError: If their number is wrong, or a position is NaN or outside the grid; the message names it
+            and the limits.
     """
     x = np.asarray(x, np.float64)
     if x.ndim < 2 or x.shape[-1] != 3:
@@ -23,7 +24,7 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
     if x.shape[-2] != particles:
         raise ArgumentError(f"{label} are {x.shape[-2]}, but the scene has {particles}")
     low, high = -0.5 / nodes, 1.0 - 1.5 / nodes
-    # Written so that NaN fails it, too.
+    # NaN must fail this comparison, too.
     inside = np.all((x >= low) & (x < high), axis=-1)
     if not inside.all():
         first = tuple(np.argwhere(~inside)[0].tolist())
@@ -35,15 +36,15 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
 
 @ti.data_oriented
 class Starts:
-    """Kernels that change the states of some environments and leave the others as they are."""
+    """Kernels that replace the states of selected environments."""
 
     def __init__(self, engine: Any) -> None:
-        """Take over the CPU's or CUDA's kernels."""
+        """Initialise with the kernels of the CPU or CUDA."""
         self.engine = engine
 
     @ti.kernel
     def copy_chosen(self, source: Array, target: Array, chosen: Array):
-        """Copy the particle states of the environments with a number other than 0 in ``chosen``."""
+        """Copy the particle states of environments with a nonzero entry in ``chosen``."""
         for q in range(self.engine.batch * self.engine.tiles * self.engine.lanes):
             e, place = self.engine.particle_of(q)
             if chosen[e] != 0:
@@ -54,7 +55,8 @@ class Starts:
 
     @ti.kernel
     def place_at_rest(self, target: Array, e: ti.i32, order: Array, x: Array):
-        """Write particles at rest to an environment's state, by their numbers at each place."""
+        """Write particles at rest to an environment's state, given the number of the particle at each place.
+        """
         for place in range(self.engine.particles):
             entry = self.engine.tile_entry(0, e, place // self.engine.lanes)
             lane = place % self.engine.lanes

@@ -1,4 +1,4 @@
-"""States, measures and rollouts that the simulator takes and returns, and environments that broke off."""
+"""States, measures and rollouts of the simulator, and detection of diverged environments."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class State:
 
 @dataclass(frozen=True)
 class Measures:
-    """Measures of a state; arrays, or CUDA tensors where the caller asked for them.
+    """Measures of a state, as arrays or, on request, CUDA tensors.
 
     Attributes:
         terms: Unweighted loss terms, in the order of :attr:`Simulator.terms`, shape [batch, term].
         iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
-            NaN before :meth:`Simulator.set_target`, and where the overlap with the target is not among the
+            NaN before :meth:`Simulator.set_target`, and if the overlap with the target is not among the
             terms.
     """
 
@@ -62,9 +62,9 @@ class Rollout:
         initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
         step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
-            [batch, T, action], or None if it was not asked for.
-        failures: Environments whose state, loss or gradient stopped being finite, and when and why; their
-            numbers mean nothing, those of the others are what they would be without them.
+            [batch, T, action], or None without ``gradient``.
+        failures: Diverged environments, with time and reason. Their numbers are meaningless; the other
+            environments are not affected.
     """
 
     initial_terms: Any
@@ -83,13 +83,13 @@ def rest_state(x: np.ndarray, poses: np.ndarray) -> State:
     return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)
 
 
-# -- environments that broke off --------------------------------------------------------------------------
+# -- diverged environments --------------------------------------------------------------------------
 
 
 def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int = 1) -> dict[int, str]:
-    """Environments whose state is broken, and since when, by the numbers, shape [batch], of the substeps in
-    which they broke, from 1 on in environment step ``first``, or 0; a CUDA tensor is fetched only if there is
-    one."""
+    """Return the diverged environments with the time of divergence, from the numbers of the substeps in which
+    they diverged, shape [batch], counted from 1 in environment step ``first``, or 0. A CUDA tensor is fetched
+    only if any environment has diverged."""
     if not faults.any():
         return {}
     if on_device(faults):
@@ -103,8 +103,7 @@ def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int =
 
 
 def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
-    """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
-    6]."""
+    """Return the environments with non-finite measures, shape [T + 1, batch, 6], and the step of each."""
     broken = ~_all_finite(values)
     first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
     when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
@@ -112,8 +111,8 @@ def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
 
 
 def broken_gradients(gradient: np.ndarray | torch.Tensor) -> dict[int, str]:
-    """Environments with a gradient that is not finite, and since which step, going backwards; gradient of
-    shape [batch, T, action]."""
+    """Return the environments with non-finite gradients, shape [batch, T, action], and the last such step of
+    each."""
     broken = ~_all_finite(gradient)
     last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
     return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
@@ -124,7 +123,7 @@ def _all_finite(values: np.ndarray | torch.Tensor) -> np.ndarray:
 
 
 def require_none(failures: Mapping[int, str]) -> None:
-    """Raise SimulationError if an environment has broken off; the first is named."""
+    """Raise SimulationError if an environment has diverged; the message names the first one."""
     if failures:
         first = min(failures)
         more = f" (and {len(failures) - 1} more environments)" if len(failures) > 1 else ""

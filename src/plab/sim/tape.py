@@ -229,7 +229,7 @@ class Tape:
 # -- callbacks between environment steps ------------------------------------------------------------------
 
 
-class Recording:
+class RecordedStates:
     """States after environment steps; arrays, or CUDA tensors where the actions were one.
 
     Attributes:
@@ -270,7 +270,7 @@ class Recording:
             self._particles.losses(terms, 0, state, slot)
             self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
 
-    def finish(self, poses: Any, back: Callable[[], Any], is_current: Callable[[], bool]) -> Recording:
+    def finish(self, poses: Any, back: Callable[[], Any], is_current: Callable[[], bool]) -> RecordedStates:
         """Offer what was noted, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the way back
         while it ``is_current``."""
         e = self._engine

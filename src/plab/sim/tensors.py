@@ -1,7 +1,7 @@
-"""Arrays and CUDA tensors of PyTorch in and out of the simulator; the latter without a way through the host.
+"""Transfer of arrays and PyTorch's CUDA tensors to and from the simulator; tensors stay on the device.
 
-Taichi and PyTorch work in the same context and in the default stream; a kernel takes a tensor's memory as it
-takes an array's.
+Taichi and PyTorch share the CUDA context and the default stream, so kernels can access the memory of a tensor
+directly.
 """
 
 import sys
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from plab.errors import ArgumentError
 from plab.sim.compiler import ti
 
-# What kernels take: an array of Taichi's or NumPy's or a CUDA tensor, of numbers or of vectors.
+# Kernel arguments: Taichi or NumPy arrays or CUDA tensors, of numbers or of vectors.
 if TYPE_CHECKING:
     import torch
     from typing_extensions import TypeIs
@@ -30,10 +30,11 @@ def on_device(array: object) -> "TypeIs[torch.Tensor]":
 
 
 class Constants:
-    """Numbers that meet arrays and CUDA tensors in every step, and go to the device only once."""
+    """Constants that are combined with arrays and CUDA tensors in every step; they are copied to the device
+    only once."""
 
     def __init__(self, values: ArrayLike) -> None:
-        """Take over numbers, of any shape."""
+        """Store numbers of any shape."""
         self._values = np.asarray(values, np.float64)
         self._tensor: torch.Tensor | None = None
 
@@ -48,8 +49,8 @@ class Constants:
 
 @ti.kernel
 def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, writes: ti.i32):
-    """Write numbers to an array from its entry ``first``, in its type, or read them from there: by one
-    kernel for all arrays, as each takes a tenth of a second to load on CUDA."""
+    """Write numbers to an array from its entry ``first`` on, or read them. All arrays share one kernel,
+    because loading a kernel takes a tenth of a second on CUDA."""
     for i in range(count):
         if writes != 0:
             array[first + i] = numbers[i]
@@ -58,8 +59,8 @@ def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, wri
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
-    """Let ``fill`` launch a kernel that fills a new tensor of ``count`` numbers, in float64 if ``double``;
-    the result takes device and type of a CUDA tensor."""
+    """Return a new tensor of ``count`` numbers on the device and of the type of a CUDA tensor, filled by the
+    kernel that ``fill`` launches, in float64 if ``double``."""
     torch = sys.modules["torch"]
     out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
     if count:
@@ -72,8 +73,8 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
 def numbers_of(
     array: ti.Ndarray, shape: tuple[int, ...], like: object, first: int = 0
 ) -> "np.ndarray | torch.Tensor":
-    """Copy entries of a device array, from entry ``first`` on, to an array of some shape, or to a tensor of
-    the type of a CUDA tensor ``like``."""
+    """Copy entries of a device array, from entry ``first`` on, to an array of the given shape, or to a tensor
+    like the CUDA tensor ``like``."""
     count = int(np.prod(shape))
     if on_device(like):
         filled = output_for(lambda out: copy_numbers(array, first, out, count, 0), count, True, like)
@@ -91,15 +92,16 @@ def step_actions(
     device: str,
     through: Callable[[Any], Any] | None = None,
 ) -> "np.ndarray | torch.Tensor | ti.Ndarray":
-    """Actions of one environment step, shape [batch, component], for the kernels, which take them from where
-    they are; float64.
+    """Return the actions of one environment step for the kernels, shape [batch, component], float64, on the
+    device they are on.
 
     Args:
         actions: The actions.
         batch: Number of environments.
         components: Number of components.
         device: ``cpu`` or ``cuda``.
-        through: Turns checked actions, shape [T, batch, component], into those of the manipulators, likewise.
+        through: Function that converts checked actions, shape [T, batch, component], to actions of the
+            manipulators.
 
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
@@ -108,9 +110,9 @@ def step_actions(
     if through is not None:
         numbers = through(numbers.reshape(1, batch, components)).reshape(-1)
     if on_device(numbers) and device == "cuda" and numbers.shape[0]:
-        # Another stream may use their memory again before the kernels have read it.
+        # Another stream might reuse the memory before the kernels have read it.
         return numbers if _in_default_stream() else _array_of(numbers, device)
-    # A copy: kernels take arrays as something that they might write to.
+    # Copy, because Taichi assumes that kernels may write to arrays.
     array = np.zeros(max(1, numbers.shape[0]))
     array[: numbers.shape[0]] = numbers.cpu() if on_device(numbers) else numbers
     return array
@@ -123,8 +125,8 @@ def action_array(
     device: str,
     through: Callable[[Any], Any] | None = None,
 ) -> ti.Ndarray:
-    """Actions of a rollout, shape [batch, T, component], for the kernels: step by step, float64; arguments
-    and errors as those of :func:`step_actions`."""
+    """Return the actions of a rollout, shape [batch, T, component], for the kernels, ordered by step,
+    float64; arguments and errors as for :func:`step_actions`."""
     numbers = _numbers(actions, (batch, None, components))
     if through is not None:
         numbers = through(numbers.reshape(-1, batch, components)).reshape(-1)
@@ -134,9 +136,9 @@ def action_array(
 def _numbers(
     actions: "np.ndarray | torch.Tensor", expected: tuple[int | None, ...]
 ) -> "np.ndarray | torch.Tensor":
-    """Actions one after the other, step by step where ``expected`` leaves the number of steps open (None), in
-    float64; a CUDA tensor is complete when this returns. ArgumentError unless they have the shape and are
-    finite."""
+    """Return the actions as a flat float64 array, ordered by step if ``expected`` leaves the number of steps
+    open (None). CUDA tensors are complete on return. Raise ArgumentError for wrong shapes and non-finite
+    actions."""
     try:
         actions = actions.detach() if on_device(actions) else np.asarray(actions, np.float64)
     except (TypeError, ValueError) as error:
@@ -176,7 +178,7 @@ def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
 
 
 def _in_default_stream() -> bool:
-    """Return True if PyTorch works in the stream of Taichi's kernels, so that neither waits for the other.
+    """Return True if PyTorch uses the stream of Taichi's kernels, so that no synchronisation is needed.
 
     A CUDA tensor implies that PyTorch is imported.
     """
