@@ -18,7 +18,7 @@ from scipy import stats
 from plab.cli.command import Parser, command_line, positive, sources_and_words, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, drawn_configs, load_config
-from plab.config.selection import OBSERVED
+from plab.config.selection import OBSERVATION_KEYS
 from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
@@ -65,7 +65,7 @@ def rows(
     for path in paths:
         policy, config = load_policy(path), read(Path(path)).config
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
-        seen = [f"{key}={config[key]}" for key in OBSERVED]
+        seen = [f"{key}={config[key]}" for key in OBSERVATION_KEYS]
         cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
         every = drawn_configs(cfg, range(FIRST, FIRST + count))
         # Building them says what is wrong with all of them.

@@ -11,7 +11,7 @@ import torch
 
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
-from plab.problem import Trials
+from plab.problem import BatchMeasures
 from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.actors import DEVIATION_MIN, training_scenes
@@ -212,7 +212,7 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monk
     plans, tried, problem = [], [], training.batch.problem
     improve, simulate = training._improved, problem.try_out
 
-    def try_out(actions: np.ndarray, gradient: bool) -> Trials:
+    def try_out(actions: np.ndarray, gradient: bool) -> BatchMeasures:
         tried.append(actions)
         return simulate(actions, gradient=gradient)
 
@@ -237,7 +237,7 @@ def test_what_is_observed_is_moved_together() -> None:
     batch, _ = environments(cfg)
     training, given = PodsTraining([cfg], batch), []
     training.statistics.var = np.linspace(0.25, 4.0, batch.observation_space.shape[0])
-    training.hold_moments()
+    training.freeze_moments()
     training.network.register_forward_pre_hook(lambda _, seen: given.extend(seen))
     start = torch.as_tensor(batch.reset()[0])
     seen = training.scaled(torch.cat([start] * 50)[:100])
@@ -263,7 +263,7 @@ def test_environments_that_break_off_teach_nothing(
     batch, learned = training.batch, []
     try_out, imitate = batch.problem.try_out, training.imitate
 
-    def breaking(actions: np.ndarray, gradient: bool) -> Trials:
+    def breaking(actions: np.ndarray, gradient: bool) -> BatchMeasures:
         trials = try_out(actions, gradient=gradient)
         trials.gradient[broken] = np.nan
         return replace(trials, failures={e: f"environment {e}: broke off" for e in broken})

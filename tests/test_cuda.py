@@ -16,5 +16,5 @@ from cuda_scenes import assert_cuda_agrees_with_the_cpu
 def test_steps_of_one_launch_agree_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 1000)
     # Warps share tiles by 11, 11 and 10 particles.
-    monkeypatch.setattr(cuda_engine, "PARTS_MOST", 3)
+    monkeypatch.setattr(cuda_engine, "MAX_TILE_WARPS", 3)
     assert_cuda_agrees_with_the_cpu("nearest")

@@ -18,7 +18,7 @@ from plab.envs.autograd import simulate
 from plab.losses import TERMS, check_gradient, make_terms
 from plab.losses.chamfer import POINTS
 from plab.losses.term import DistanceTerm
-from plab.objective import lumps, soft_iou
+from plab.objective import mass_portions, soft_iou
 from plab.results import check, load, read
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim import SimulationError, Simulator
@@ -83,7 +83,7 @@ def test_chamfer_is_that_of_particles_and_points_of_the_target(device: str) -> N
     for _ in range(2):
         got = simulator.losses()[:, 0]
     for e, x in enumerate(simulator.state().x):
-        square = cdist(x, lumps(mass[e], POINTS)) ** 2
+        square = cdist(x, mass_portions(mass[e], POINTS)) ** 2
         assert got[e] == pytest.approx(square.min(axis=0).mean() + square.min(axis=1).mean(), rel=1e-5)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from plab.config import ConfigError, MethodConfig, load_config
 from plab.config.families import FAMILIES, Family
-from plab.plugins import load_object, passed_on, search_in
+from plab.plugins import exported_module_path, load_object, search_in
 from plab.results import check, read
 from plab.runners import Runner, run_batch
 from plab.sweep.plan import plan
@@ -44,7 +44,7 @@ def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path) -> No
     # Behind everything else, and once.
     assert sys.path[-2:] == [str(folder), str(folder.parent)] and sys.path.count(str(folder)) == 1
     before = os.environ.get("PYTHONPATH")
-    with passed_on():
+    with exported_module_path():
         command = [sys.executable, "-c", "import zz_above, plab; print(zz_above.FOUND)"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == "2\n" and os.environ.get("PYTHONPATH") == before

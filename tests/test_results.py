@@ -158,8 +158,8 @@ def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, com
 def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Generator, caplog) -> None:
     state = make_state(rng)
     run = RunFile(make_config(tmp_path))
-    run.spend("optimise", 0.01)
-    run.spend("optimise", 0.02)
+    run.add_time("optimise", 0.01)
+    run.add_time("optimise", 0.02)
     run.result.provenance["torch"] = "0.4"
     run.record(make_row(0), make_state(rng))
     run.record(make_row(1), state, best_loss=0.5, best_iteration=1)

@@ -15,7 +15,7 @@ import pytest
 
 import synthetic
 from plab.cli.results import main
-from plab.cli.rollouts import render, settle
+from plab.cli.rollouts import render, resolve_rollout
 from plab.config.selection import Selection
 from plab.report.collect import collect
 from plab.report.series import load_series
@@ -247,6 +247,6 @@ def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told) -> N
     pack(folder, folder.parent / "all.plab.zip.xz")
     for source in (folder, folder.parent / "all.plab.zip.xz"):
         options = Namespace(what=[str(source), "task=Rope"], output=None)
-        assert settle(options, ".png") == Path("Rope-v1-adam-seed1.png")
+        assert resolve_rollout(options, ".png") == Path("Rope-v1-adam-seed1.png")
         assert read(options.result).config["seed"] == 1
     assert str(folder) in told([str(folder), "seed=3"], render)

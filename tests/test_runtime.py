@@ -11,7 +11,7 @@ import pytest
 
 from plab.sim import compiler
 from plab.sim.compiler import QUADRANTS, ti
-from plab.sim.runtime import available_threads, free_abandoned_cache, start_runtime
+from plab.sim.runtime import available_threads, remove_stale_cache_lock, start_runtime
 
 
 def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
@@ -30,7 +30,7 @@ def test_a_killed_process_leaves_no_lock_on_compiled_kernels(tmp_path, monkeypat
     for age, left in ((1.0, True), (60.0, False), (60.0, False)):
         if lock.exists():
             os.utime(lock, (time.time() - age,) * 2)
-        free_abandoned_cache()
+        remove_stale_cache_lock()
         assert lock.exists() == left
 
 

@@ -28,8 +28,8 @@ from plab.submissions.board import Board, board
 from plab.submissions.submission import (
     UNSEEN,
     Card,
+    Checksums,
     Configuration,
-    Digests,
     Entry,
     Submission,
     SubmissionError,
@@ -55,7 +55,7 @@ from synthetic_runs import synthetic_run, template
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)
 GOOD = dataclasses.asdict(CARD) | {"authors": list(CARD.authors)}
-DIGESTS = Digests("a" * 64, "b" * 64)
+DIGESTS = Checksums("a" * 64, "b" * 64)
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
 
 
@@ -241,7 +241,7 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
         cfg = load_config(words)
         configuration = configuration_of(cfg)
         assert configuration.name == name
-        assert Digests.of(configuration.config(())) == Digests.of(cfg)
+        assert Checksums.of(configuration.config(())) == Checksums.of(cfg)
     words = ["task=Torus", "variant=2", "protocol=release", "targets.source=there"]
     authors = configuration_of(load_config(words))
     assert authors.name == "Torus-v2-authors-release"
@@ -278,7 +278,7 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
     assert [e.configuration.name for e in found.entries] == ["Move-v1", "Move-v2"]
     assert found.entries[0].score == pytest.approx(0.4)
     assert found.entries[0].steps % 50 == 0 and 50 <= found.entries[0].steps <= 200
-    assert found.entries[0].digests == Digests.of(load_config(["task=Move"]))
+    assert found.entries[0].digests == Checksums.of(load_config(["task=Move"]))
 
 
 def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Callable[..., str]) -> None:
@@ -300,7 +300,7 @@ def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Ca
 
 
 def real(variant: str, steps: int, score: float, **which: Any) -> Entry:
-    digests = Digests.of(Configuration("Move", variant).config(()))
+    digests = Checksums.of(Configuration("Move", variant).config(()))
     return entry(variant, steps, score, digests=digests, **which)
 
 

@@ -111,7 +111,7 @@ def test_no_better_score_is_given_up() -> None:
     for iteration in range(30):
         soft, loss = rng.random(2)
         finalists.add(np.full((2, 1), soft), iteration, {"loss": loss, "score": soft})
-        if iteration % trajectory.CHECK == trajectory.CHECK - 1:
+        if iteration % trajectory.CHECK_INTERVAL == trajectory.CHECK_INTERVAL - 1:
             for one in (finalists.highest, finalists.lowest):
                 one.hard_score = float(rng.random())
                 shown.append(one.hard_score)

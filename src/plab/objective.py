@@ -25,8 +25,8 @@ __all__ = [
     "chamfer_distance",
     "check_terms",
     "earth_movers_distance",
-    "lumps",
     "mass_change",
+    "mass_portions",
     "rewards",
     "score_scale",
     "scores",
@@ -47,8 +47,8 @@ TARGET_ENTRIES = 14
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian by which :func:`mass_change` smooths [domain units]."""
 
-TRANSPORTED = 512
-"""Number of lumps of mass of :func:`earth_movers_distance`."""
+TRANSPORT_PORTIONS = 512
+"""Number of portions of mass in :func:`earth_movers_distance`."""
 
 TINY = 1e-12
 """Share of the mass below which nothing has to move."""
@@ -174,8 +174,8 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
 def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
     """Chamfer distance of two mass tensors, shape [n, n, n] [domain units].
 
-    The mean distance of the mass of each from the nodes of the other, summed; below a cell the grid does not
-    tell it.
+    Sum of the mean distances from the mass of each tensor to the nearest node of the other. Distances below a
+    cell are not resolved.
     """
     # The release's stencil makes a few masses negative.
     a, b = (np.asarray(mass, np.float64).clip(0.0) for mass in (a, b))
@@ -183,16 +183,16 @@ def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
     return float((a * away[0]).sum() / a.sum() + (b * away[1]).sum() / b.sum())
 
 
-def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORTED) -> float:
-    """Mean distance by which mass has to be moved, at least, to make one mass tensor of another.
+def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PORTIONS) -> float:
+    """Earth mover's distance between two mass tensors: least mean distance to transport one into the other.
 
-    Each is divided into so many lumps of equal mass, of neighbouring nodes along a space-filling curve, and
-    lumps are assigned to lumps; of shapes far apart it is exact to a lump's size.
+    Both tensors are divided into portions of equal mass, of neighbouring nodes along a space-filling curve,
+    which are matched optimally. For shapes far apart the result is exact up to the size of a portion.
 
     Args:
         a: Mass tensor, shape [n, n, n].
         b: Mass tensor of the same shape.
-        points: Number of lumps.
+        points: Number of portions.
 
     Returns:
         Distance [domain units]; 0 for equal tensors.
@@ -201,19 +201,21 @@ def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORTED)
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    distances = cdist(lumps(np.asarray(a, np.float64), points), lumps(np.asarray(b, np.float64), points))
+    distances = cdist(
+        mass_portions(np.asarray(a, np.float64), points), mass_portions(np.asarray(b, np.float64), points)
+    )
     return float(distances[linear_sum_assignment(distances)].mean())
 
 
-def lumps(mass: np.ndarray, count: int) -> np.ndarray:
-    """Return the centroids of lumps of equal mass, shape [count, 3]."""
+def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
+    """Return the centroids of portions of equal mass, shape [count, 3]."""
     node = np.argwhere(mass > 0.0)
     # Morton's order: the bits of the three indices in turn.
     bits = (node[:, :, None] >> np.arange(mass.shape[0].bit_length())) & 1
     code = (bits << (3 * np.arange(bits.shape[2]) + np.arange(3)[:, None])).sum(axis=(1, 2))
     node = node[code.argsort()]
     ends = np.concatenate([[0.0], mass[tuple(node.T)].cumsum()])
-    # Integrals of the positions up to the ends of the lumps.
+    # Integrals of the positions up to the ends of the portions.
     moments = np.concatenate([np.zeros((1, 3)), (node / len(mass) * np.diff(ends)[:, None]).cumsum(axis=0)])
     cuts = np.linspace(0.0, ends[-1], count + 1)
     sums = np.stack([np.interp(cuts, ends, moments[:, axis]) for axis in range(3)], axis=1)

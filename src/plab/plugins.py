@@ -40,7 +40,7 @@ def search_in(config_dir: str | Path) -> None:
 
 
 @contextmanager
-def passed_on() -> Iterator[None]:
+def exported_module_path() -> Iterator[None]:
     """Let processes that are started inside the ``with`` block find the modules that this one finds."""
     before = os.environ.get("PYTHONPATH")
     # What comes with Python is left out: the other process may be one of another version.

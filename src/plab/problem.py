@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from plab.scenes import Scene
 
 __all__ = [
+    "BatchMeasures",
     "Episodes",
     "Problem",
-    "Trials",
     "build_scenes",
     "fits",
     "kinds_of",
@@ -83,7 +83,7 @@ class Episodes:
 
 
 @dataclass(frozen=True)
-class Trials:
+class BatchMeasures:
     """Totals of many sequences of actions; arrays, or CUDA tensors if the actions were one.
 
     Attributes:
@@ -300,7 +300,7 @@ class Problem:
         tensors."""
         return batch_scores(self._scale.like(iou), iou)
 
-    def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> Trials:
+    def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
         """Run actions from the initial states, in the current contact model, and total their measures. CUDA
         tensors stay on the device, failures excepted.
 
@@ -323,7 +323,7 @@ class Problem:
         total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
-        return Trials(measures, loss[:, -1], result.gradient, result.failures)
+        return BatchMeasures(measures, loss[:, -1], result.gradient, result.failures)
 
     def rollout(
         self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True

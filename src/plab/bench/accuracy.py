@@ -43,7 +43,7 @@ QUICK_TASKS = ("Move", "Rope")
 STEP_TIME = 19e-4
 """Simulated time of an environment step of the suite [s]."""
 
-EFFORT = 0.7
+ACTION_SCALE = 0.7
 """Factor on the demonstration's actions."""
 
 COLUMNS = (
@@ -232,7 +232,7 @@ class Attempt:
         mass = scene.particle_mass * scene.particle_count
         target = spread_mass(end, scene.grid_size, mass / len(end))
         simulator.set_target(target[None], target_sdf(target, 0.1 * scene.particle_mass)[None])
-        actions, found = EFFORT * self.demonstration[None], {}
+        actions, found = ACTION_SCALE * self.demonstration[None], {}
         for contact in CONTACTS:
             simulator.set_contact(contact)
             seconds = []

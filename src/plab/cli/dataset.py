@@ -18,7 +18,7 @@ from plab.cli.command import Parser, command_line, folder, positive, sources_and
 from plab.cli.tables import print_table
 from plab.config import Config
 from plab.config.compose import check_sources, require_runnable
-from plab.config.selection import OBSERVED, one_protocol, select
+from plab.config.selection import OBSERVATION_KEYS, one_protocol, select
 from plab.config.suite import SUITE_VARIANTS
 from plab.config.words import parse, prepared
 from plab.demonstrations import known_actions
@@ -31,7 +31,7 @@ from plab.results import read
 from plab.results.table import readable_rows
 from plab.scenes import Camera
 
-REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVED)
+REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVATION_KEYS)
 """Keys that change how the runs of results are replayed; other words choose among them."""
 
 
@@ -184,11 +184,11 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
     # Without a gradient the budget of memory has no effect, but all have to have the same.
     sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}
     sim |= {key[4:]: value for key, value in changes.items() if key.startswith("sim.")}
-    own = {key: value for key, value in changes.items() if key in OBSERVED}
+    own = {key: value for key, value in changes.items() if key in OBSERVATION_KEYS}
     found = []
     for row in rows:
         cfg, actions = result(row.path)
-        seen = {key: row.config[key] for key in OBSERVED} | own
+        seen = {key: row.config[key] for key in OBSERVATION_KEYS} | own
         cfg = replace(cfg, sim=replace(cfg.sim, **sim), seed_scene=row.config.get("seed_scene"), **seen)
         cfg.check()
         check_sources(cfg)
@@ -264,7 +264,7 @@ class _Recorder:
     def env_spec(self) -> gymnasium.envs.registration.EnvSpec:
         """Return the environment of the first episode, for minari's ``recover_environment``."""
         cfg = self._all[0].cfg
-        words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVED)]
+        words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
         words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
         words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
         kwargs: dict[str, Any] = {

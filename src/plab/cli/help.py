@@ -44,7 +44,7 @@ FLAGS
   --help-all        more examples, what each choice is, and every key with its default
 """
 
-_OFTEN = {
+_COMMON_KEYS = {
     "config.yaml": ("variant", "seed", "results_dir", "force", "progress", "logger"),
     "method/adam.yaml": ("method.iterations", "method.lr"),
     "sim/fast.yaml": ("sim.device", "sim.particles_scale"),
@@ -66,7 +66,7 @@ def help_text(config_dir: str | None = None) -> str:
         names = ", ".join(choices(group, config_dir))
         parts += textwrap.wrap(names, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
     parts += ["", "KEYS used often, with their defaults"]
-    for name, keys in _OFTEN.items():
+    for name, keys in _COMMON_KEYS.items():
         for key, line in _keys(conf_folder() / name, _SHORT):
             if key in keys:
                 parts += textwrap.wrap(line, _WIDTH, subsequent_indent=" " * (_SHORT + 3))

@@ -21,7 +21,7 @@ from plab.errors import tell
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
-from plab.report.media import lacking, remove_earlier
+from plab.report.media import missing_pictures, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_notebooks
 from plab.report.page import Page
 from plab.report.reference import ACCURACY, SPEED, measured
@@ -34,7 +34,7 @@ YIELD_STRESS = "task.yield_stress"
 _PAUSE = 5.0
 """Interval at which ``--follow`` reads the runs [s]."""
 
-_QUIET = 2
+_IDLE_CHECKS = 2
 """Looks in a row at which no run is under way, until it ends: a sweep's next run may be about to begin."""
 
 
@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
             for line in runs.left_out():
                 tell(line)
             before = now
-        if not options.follow or quiet == _QUIET:
+        if not options.follow or quiet == _IDLE_CHECKS:
             return
         time.sleep(_PAUSE)
 
@@ -83,7 +83,7 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
 def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
     _require_runs(runs, options.sources)
     page = Page(runs, out, origin(runs, command, deep=False), every_run=options.every_run)
-    wanted = lacking(page.shown, out) if options.pictures else {}
+    wanted = missing_pictures(page.shown, out) if options.pictures else {}
     # It is complete but for pictures before the first of them is drawn.
     page.write(drawing=bool(wanted))
     if wanted:

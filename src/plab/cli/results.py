@@ -63,7 +63,7 @@ def _scores(argv: Sequence[str]) -> None:
     sources, words = sources_and_words(options.sources)
     chosen = _finished_by_default(select(words, SELECTABLE))
     table, unreadable = scores(sources, chosen, options.keys, options.sort, descending=options.descending)
-    _tell_left_out(unreadable)
+    _report_skipped(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
 
 
@@ -75,7 +75,7 @@ def _sql(argv: Sequence[str]) -> None:
     add_forms(parser)
     options = parser.parse_intermixed_args(argv)
     columns, rows, unreadable = query(sources_and_words(options.sources)[0], options.query)
-    _tell_left_out(unreadable)
+    _report_skipped(unreadable)
     print_table(columns, rows, options.form)
 
 
@@ -123,7 +123,7 @@ def _pack(argv: Sequence[str]) -> None:
         keep_resume=options.resume,
         digits=options.digits,
     )
-    _tell_left_out(done.unreadable)
+    _report_skipped(done.unreadable)
     before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
     print(f"{options.output}: {done.runs} run(s), {done.archive_bytes / 1e3:.1f} kB{before}")
 
@@ -146,7 +146,7 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
-def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
+def _report_skipped(unreadable: Iterable[ResultsError]) -> None:
     for error in unreadable:
         tell(f"left out: {error}")
 

@@ -12,7 +12,7 @@ import numpy as np
 from plab.cli.command import Parser, command_line, folder, positive, require_writable, sources_and_words
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
-from plab.config.run import IDLE
+from plab.config.run import RUN_ONLY_KEYS
 from plab.config.selection import one_protocol, select
 from plab.config.suite import EXTENSION_TASKS
 from plab.config.words import require_effect
@@ -22,13 +22,13 @@ from plab.render.graphics import RenderError, require_graphics, require_packages
 if TYPE_CHECKING:
     from plab.config import Config
 
-WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
+KEYS_WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *RUN_ONLY_KEYS)
 """Keys of a configuration that change no picture."""
 
 _FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
 """Pixels of a film's frame, of a cell of the contact sheet, and of a frame of the film strip."""
 
-_LARGEST = 4096
+_MAX_FRAME_SIZE = 4096
 """Pixels of a frame's side, at most: what every OpenGL can draw, and H.264 can hold."""
 
 
@@ -68,7 +68,7 @@ def render(argv: Sequence[str]) -> None:
         own = ("task=", "variant=") if options.contact_sheet else ("task=",)
         _refuse_choice(options, own)
     else:
-        path = settle(options, ".png")
+        path = resolve_rollout(options, ".png")
     require_writable(path)
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
@@ -113,7 +113,7 @@ def view(argv: Sequence[str]) -> None:
         _refuse_choice(options, ("task=",))
         output = (options.output or Path("gallery")) / "index.html"
     else:
-        output = settle(options, ".html")
+        output = resolve_rollout(options, ".html")
     if output.suffix.lower() != ".html":
         raise RenderError(f"cannot write {output}: its suffix must be .html")
     require_writable(output)
@@ -157,7 +157,7 @@ def export(argv: Sequence[str]) -> None:
     what = "by default named like the result or the task"
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
     options = parser.parse_intermixed_args(argv)
-    output = settle(options, f"-{options.format}")
+    output = resolve_rollout(options, f"-{options.format}")
     require_writable(output / "target")
     if output.is_dir() and any(output.iterdir()):
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
@@ -183,7 +183,7 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
     return parser
 
 
-def settle(options: argparse.Namespace, ending: str) -> Path:
+def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     """Find the rollout, as far as can be done without simulating.
 
     Adds ``result``, the result file or None, and ``config``, the configuration where there is none; and
@@ -213,7 +213,7 @@ def settle(options: argparse.Namespace, ending: str) -> Path:
         place = Path() if split_archive(options.result) else options.result.parent
         usual = place / (options.result.stem + ending)
     elif words:
-        require_effect(words, WITHOUT_EFFECT, "a picture")
+        require_effect(words, KEYS_WITHOUT_EFFECT, "a picture")
         options.result = None
         cfg = options.config = load_config(words, options.config_dir)
         check_sources(cfg)
@@ -242,7 +242,7 @@ def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
 
 
 def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
-    """Return configuration and actions, shape [T, A], of the rollout that :func:`settle` found."""
+    """Return configuration and actions, shape [T, A], of the rollout that :func:`resolve_rollout` found."""
     from plab.render import rollouts
 
     if options.result:
@@ -255,7 +255,7 @@ def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
 
 def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
     """Refuse results, and words that begin like one of ``own``, for a picture of all tasks."""
-    require_effect([word for word in options.what if "=" in word], WITHOUT_EFFECT, "a picture")
+    require_effect([word for word in options.what if "=" in word], KEYS_WITHOUT_EFFECT, "a picture")
     unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
     if unwanted or (options.output and not getattr(options, "gallery", False)):
         raise ArgumentError(f"all tasks are shown: leave out '{(*unwanted, '--output')[0]}'")
@@ -277,8 +277,8 @@ def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[
 def _size(text: str) -> tuple[int, int]:
     """Read a size such as 480x360; H.264 needs even numbers."""
     numbers = [int(number) for number in text.split("x") if number.isdecimal()]
-    if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _LARGEST for number in numbers):
+    if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _MAX_FRAME_SIZE for number in numbers):
         raise argparse.ArgumentTypeError(
-            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_LARGEST}"
+            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_MAX_FRAME_SIZE}"
         )
     return numbers[0], numbers[1]

@@ -212,11 +212,11 @@ class Config:
 SUFFIX = ".h5"
 """End of the names of result files."""
 
-IDLE = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
+RUN_ONLY_KEYS = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
 """Keys that only ``plab run`` uses."""
 
 _NO_EFFECT = {
-    "": IDLE,
+    "": RUN_ONLY_KEYS,
     # Gradients are the same bits for any spacing of checkpoints.
     "sim": ("memory_mb",),
     # Name and score change no number, and the contact term is that of the method.

@@ -11,7 +11,7 @@ from typing import Any
 from plab.config.suite import SUITE_VARIANTS, group_names
 from plab.errors import ArgumentError, pick
 
-OBSERVED = ("observe_particles", "observe_target")
+OBSERVATION_KEYS = ("observe_particles", "observe_target")
 """Keys of a configuration that say which numbers an observation holds."""
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from plab.problem import Problem
     from plab.sim import RecordedStates, Simulator, State
 
-__all__ = ["States", "Stretch", "policy_gradient", "rollout", "simulate"]
+__all__ = ["PolicySteps", "States", "policy_gradient", "rollout", "simulate"]
 
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
@@ -203,7 +203,7 @@ def _start(simulator: Simulator, parts: dict[str, np.ndarray]) -> None:
         simulator.set_initial_state(replace(simulator.state(), **parts))
 
 
-class Stretch(NamedTuple):
+class PolicySteps(NamedTuple):
     """Some steps of a policy in a batch of episodes.
 
     Attributes:
@@ -227,7 +227,7 @@ def policy_gradient(
     parameters: Iterable[torch.Tensor] | None = None,
     discount: float = 1.0,
     value: Callable[[torch.Tensor], torch.Tensor] | None = None,
-) -> Stretch:
+) -> PolicySteps:
     """Run a policy from where a batch of episodes stands, and add the gradient of its loss to the ``grad`` of
     its parameters.
 
@@ -294,4 +294,4 @@ def policy_gradient(
     terms = batch.closed_loop(steps, choose, react, discount=discount, like=like if like.is_cuda else None)
     loss = batch.problem.loss_of(terms)
     shown = [torch.as_tensor(array).to(like).transpose(0, 1) for array in (terms, loss)]
-    return Stretch(torch.stack(seen).detach(), torch.stack(done).detach(), *shown)
+    return PolicySteps(torch.stack(seen).detach(), torch.stack(done).detach(), *shown)

@@ -18,9 +18,9 @@ from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config
 from plab.config.draws import Values, with_own_materials
-from plab.config.selection import OBSERVED
+from plab.config.selection import OBSERVATION_KEYS
 from plab.config.words import prepared
-from plab.envs.draws import Draws
+from plab.envs.draws import EpisodeRandomizer
 from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.envs.stages import Stages, staged
 from plab.errors import ArgumentError
@@ -343,7 +343,7 @@ class EpisodeBatch:
         self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
-        self.draws = Draws(cfgs, problem)
+        self.draws = EpisodeRandomizer(cfgs, problem)
         self._observer = Observer(problem, cfgs[0])
         self._stages = Stages(cfgs, problem) if self._goes_by_stages and any(map(staged, cfgs)) else None
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
@@ -435,7 +435,7 @@ class EpisodeBatch:
                 self._seeds[e], self._episodes[e] = (int(seed),), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = [(*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)]
-        changed = self.draws.redraw(rows, entropy, options or {})
+        changed = self.draws.randomize_episodes(rows, entropy, options or {})
         if self._stages:
             changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers
@@ -474,7 +474,7 @@ class EpisodeBatch:
             for table, old in zip(self._last, before, strict=True):
                 mapped(lambda now, then: _restore_rows(now, then, rows), table, old)
 
-    def require_going(self, idle: np.ndarray | None = None) -> None:
+    def require_running(self, idle: np.ndarray | None = None) -> None:
         """Raise ResetNeeded if an episode has ended, also by breaking off, except ``idle`` ones."""
         if np.any(self.over if idle is None else self.over & ~idle):
             raise ResetNeeded("the episode is over: call reset() before step()")
@@ -784,7 +784,7 @@ class Restorable:
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """Refuse configurations whose observations hold different entries."""
-    for key in OBSERVED:
+    for key in OBSERVATION_KEYS:
         if len({getattr(cfg, key) for cfg in cfgs}) > 1:
             raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 

@@ -57,7 +57,7 @@ class _Base:
         return self.particles
 
 
-class Draws:
+class EpisodeRandomizer:
     """Draws of the sub-environments of a batch.
 
     Attributes:
@@ -119,7 +119,7 @@ class Draws:
             for key, like in sorted(known.items())
         }
 
-    def redraw(
+    def randomize_episodes(
         self, environments: Sequence[int], seeds: Sequence[Sequence[int]], given: Mapping[str, Any]
     ) -> bool:
         """Draw the next episodes of some sub-environments, and change the simulator's scenes and targets.

@@ -109,7 +109,7 @@ class PlabVecEnv(VecEnv):
             gymnasium.error.ResetNeeded: If no episode has been started.
         """
         if not self.together:
-            self.batch.require_going()
+            self.batch.require_running()
         done = self.batch.step(self._actions, strict=False)
         observation, infos = done.observation, self._split(done.info, done.failures)
         over = done.truncated if self.together else done.over

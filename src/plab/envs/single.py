@@ -98,7 +98,7 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
             ValueError: If the shape is wrong or an entry is not finite.
             gymnasium.error.ResetNeeded: If the episode is over.
         """
-        self.batch.require_going()
+        self.batch.require_running()
         done = self.batch.step(np.asarray(action)[None], strict=False)
         ends = bool(done.terminated[0]), bool(done.cut_off[0])
         return _first(done.observation), float(done.reward[0]), *ends, info_of(done.info, 0, done.failures)

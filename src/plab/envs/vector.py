@@ -124,7 +124,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             none = np.zeros(self.num_envs, bool)
             observation, info = self._restarted(idle)
             return observation, np.zeros(self.num_envs), none, none.copy(), info
-        self.batch.require_going(idle)
+        self.batch.require_running(idle)
         done = self.batch.step(np.asarray(actions), strict=False, idle=idle)
         observation, reward = done.observation, np.where(idle, 0.0, done.reward)
         terminated, truncated = done.terminated & ~idle, done.cut_off & ~idle

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from plab.kinematics.chain import Chain
     from plab.scenes import Scene
 
-__all__ = ["Drive", "JointActions", "rotation_vector"]
+__all__ = ["JointActions", "LinkMotion", "rotation_vector"]
 
 
-class Drive:
+class LinkMotion:
     """Motion of the links in some environment steps, and the way back.
 
     Attributes:
@@ -88,13 +88,13 @@ class JointActions:
         self._arrays["links"] = np.array([[link.offset for link in chain.links] for chain in chains])
         self._constants: dict[torch.device, dict[str, Tensor]] = {}
 
-    def drive(self, joints: Any, actions: Any, gradient: bool = True) -> Drive:
+    def drive(self, joints: Any, actions: Any, gradient: bool = True) -> LinkMotion:
         """Move the joints.
 
         Args:
             joints: Joint positions before the first step, shape [batch, joint].
             actions: Actions, shape [T, batch, A], float64; an array, or a tensor on any device.
-            gradient: Whether :meth:`Drive.pull_back` is to be called.
+            gradient: Whether :meth:`LinkMotion.pull_back` is to be called.
         """
         given = torch.as_tensor(actions).requires_grad_()
         before = torch.as_tensor(joints).detach().to(given).requires_grad_()
@@ -107,7 +107,7 @@ class JointActions:
             frames = self.frames(torch.stack(at))
             twists = torch.cat([_displacements(frames), _rotations(frames)], dim=-1)
             raw = torch.cat([given[..., : self._direct], twists.flatten(2)], dim=-1)
-        return Drive([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
+        return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
 
     def frames(self, joints: Tensor) -> Tensor:
         """Transforms from the links' frames to the world by joint positions, shape [T, batch, joint]; shape

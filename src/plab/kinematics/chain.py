@@ -22,7 +22,7 @@ __all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "matched", "pose_matrix"]
 Matrix = tuple[tuple[float, ...], ...]
 """Homogeneous transform, 4 rows of 4 numbers."""
 
-LEVEL = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
+IDENTITY_MATRIX = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
 """The transform that changes nothing."""
 
 BASE_JOINTS = {
@@ -190,7 +190,7 @@ class Chain:
         """
         turn = pose_matrix((0.0, 0.0, 0.0), rotation)
         base = [
-            Joint(name, k - 1, LEVEL, k >= 3, axis, low=-math.pi if k >= 3 else -1.0)
+            Joint(name, k - 1, IDENTITY_MATRIX, k >= 3, axis, low=-math.pi if k >= 3 else -1.0)
             for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ())
         ]
         base = [replace(joint, high=-joint.low) for joint in base]

@@ -13,7 +13,7 @@ import numpy as np
 
 from plab.errors import PlabError
 from plab.files import pinned
-from plab.kinematics.chain import LEVEL, Chain, Joint, Link, matched, pose_matrix
+from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, matched, pose_matrix
 
 __all__ = ["ModelError", "locate_model", "read_model"]
 
@@ -140,13 +140,13 @@ def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None,
     radius, half = lengths[:2]
     upright = pose_matrix((0.0, 0.0, 0.0), _ALONG[2])
     if kind == "SPHERE":
-        return "Sphere", [radius], np.array(LEVEL)
+        return "Sphere", [radius], np.array(IDENTITY_MATRIX)
     if kind == "CAPSULE":
         return "Capsule", [2.0 * half, radius], upright
     if kind == "CYLINDER":
         return "Cylinder", [radius, half], upright
     if kind == "BOX":
-        return "Box", lengths, np.array(LEVEL)
+        return "Box", lengths, np.array(IDENTITY_MATRIX)
     if kind != "MESH":
         return None, [], upright
     edges, longest = box[3:], int(np.argmax(box[3:]))

@@ -52,9 +52,9 @@ class PrincipalFrame:
                     [sin * x + cos * y for x, y in zip(q[i], q[j], strict=True)],
                 )
         self._axes = q
-        self.values = [self._turned(i, i) for i in range(3)] if isinstance(b[0], Node) else s[:3]
+        self.values = [self._component(i, i) for i in range(3)] if isinstance(b[0], Node) else s[:3]
 
-    def _turned(self, i, j):
+    def _component(self, i, j):
         """Component of the tensor along two of the directions."""
         full = mat_from_sym(self._b)
         row = [total(full[3 * r + c] * self._axes[j][c] for c in range(3)) for r in range(3)]
@@ -70,7 +70,7 @@ class PrincipalFrame:
         if isinstance(self._b[0], Node):
             # Zero, with the derivative of turning directions.
             for k, m in _OFF:
-                turn = frozen(self._divided_difference(principal, k, m)) * self._turned(k, m)
+                turn = frozen(self._divided_difference(principal, k, m)) * self._component(k, m)
                 both = [q[k][i] * q[m][j] + q[m][i] * q[k][j] for i, j in SYM]
                 out = [x + turn * y for x, y in zip(out, both, strict=True)]
         return out

@@ -129,16 +129,16 @@ class Trace:
 
     def sum(self, a: Number, b: Number) -> Number:
         """a + b."""
-        if _is(a, 0.0) or _is(b, 0.0):
-            return b if _is(a, 0.0) else a
+        if _equals(a, 0.0) or _equals(b, 0.0):
+            return b if _equals(a, 0.0) else a
         if _negated(b):
             return self.difference(a, b.arguments[0])
         return self.difference(b, a.arguments[0]) if _negated(a) else self.node("add", a, b)
 
     def difference(self, a: Number, b: Number) -> Number:
         """a - b."""
-        if _is(a, 0.0) or _is(b, 0.0):
-            return -b if _is(a, 0.0) else a
+        if _equals(a, 0.0) or _equals(b, 0.0):
+            return -b if _equals(a, 0.0) else a
         return self.sum(a, b.arguments[0]) if _negated(b) else self.node("sub", a, b)
 
     def product(self, a: Number, b: Number) -> Number:
@@ -157,7 +157,7 @@ class Trace:
         return self.node("mul", *sorted((a, b), key=lambda one: one.place))
 
 
-def _is(one: Number, constant: float) -> bool:
+def _equals(one: Number, constant: float) -> bool:
     return not isinstance(one, Node) and one == constant
 
 
@@ -218,7 +218,7 @@ def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Seque
     sums: dict[int, Number] = {}
 
     def share(to: Number, bar: Number) -> None:
-        if isinstance(to, Node) and to.place in varied and not _is(bar, 0.0):
+        if isinstance(to, Node) and to.place in varied and not _equals(bar, 0.0):
             sums[to.place] = sums[to.place] + bar if to.place in sums else bar
 
     for output, bar in zip(outputs, bars, strict=True):

@@ -8,7 +8,7 @@ target that none is near to.
 import numpy as np
 
 from plab.losses.term import ParticleTerm
-from plab.objective import lumps
+from plab.objective import mass_portions
 from plab.sim.compiler import ti
 
 __all__ = ["Chamfer"]
@@ -42,7 +42,7 @@ class Chamfer(ParticleTerm):
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Choose the points."""
         made = {own.tobytes(): own for own in mass}
-        points = {key: lumps(own, POINTS) for key, own in made.items()}
+        points = {key: mass_portions(own, POINTS) for key, own in made.items()}
         self.sim.write(self.points, np.stack([points[own.tobytes()] for own in mass]))
         self.sim.write(self.nearest, np.full((self.sim.batch, POINTS), FAR))
 

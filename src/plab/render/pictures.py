@@ -42,7 +42,7 @@ _SET_EVERY = 2  # environment steps from one frame to the next, of a set
 
 _PAGE_SIZE = (480, 360)
 _UNFINISHED = ".unfinished-"
-_TROUBLE = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
+_RENDER_ERRORS = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
 
 
 Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
@@ -299,7 +299,7 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
         for folders in _by_task(wanted).values():
             try:
                 made = _replayed({folder: wanted[folder] for folder in folders})
-            except _TROUBLE as error:
+            except _RENDER_ERRORS as error:
                 troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
                 continue
             for folder in folders:
@@ -326,7 +326,7 @@ def draw_strip(path: Path, picture: Path) -> None:
     require_graphics()
     try:
         save(record(*result(path)), picture, _PAGE_SIZE)
-    except _TROUBLE as error:
+    except _RENDER_ERRORS as error:
         raise RenderError(str(error)) from error
 
 

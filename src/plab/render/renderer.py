@@ -42,8 +42,11 @@ _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
 _SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
 _TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
 _NEAR = 0.01  # distance from the plasticine's surface at which the ghost vanishes [domain units]
-_CLEAREST = 0.45  # opacity of a manipulator that hides what it does
-_HIDES = (0.5, 0.8)  # share of itself with which it hides plasticine: it begins to be translucent, and is
+_MIN_OPACITY = 0.45  # opacity of a manipulator that hides what it does
+_OCCLUSION_RANGE = (
+    0.5,
+    0.8,
+)  # share of itself with which it hides plasticine: it begins to be translucent, and is
 _SHADOW = 0.6  # strength of the shadows on the floor
 _LINE = 1.3  # width of the floor's lines [pixels]
 _LINE_OPACITY = 0.16
@@ -88,7 +91,9 @@ class Renderer:
         self._floor = Floor(plotter, PAPER, INK, self.camera.pixel_size(size[1]))
         rest = sample_particles(scene)
         self._bodies = [
-            Clay(self._plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)])
+            PlasticineSurface(
+                self._plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)]
+            )
             for number, (surface, at) in enumerate(zip(self._surfaces, self._slices, strict=True))
         ]
         self._manipulators = [Rigid(self._plotter, manipulator) for manipulator in scene.manipulators]
@@ -118,14 +123,14 @@ class Renderer:
         x = np.asarray(x, np.float64)
         clouds = [Cloud(x, self._particle_area), *(rigid.cloud for rigid in self._manipulators)]
         for rigid in self._manipulators:
-            rigid.reveal(x, self.camera)
+            rigid.make_translucent(x, self.camera)
         fields = [surface.field(x[at]) for surface, at in zip(self._surfaces, self._slices, strict=True)]
         ambient = AmbientLight(clouds)
         for body, field in zip(self._bodies, fields, strict=True):
-            body.mould(surface_mesh(field), ambient)
+            body.set_shape(surface_mesh(field), ambient)
         shown = [actor for thing in self._things if thing is not self._target for actor in thing.actors]
         if self._target is not None:
-            self._target.fade(fields)
+            self._target.hide_covered_parts(fields)
             shown += self._target.ghost
         return self._draw(shown, clouds)
 
@@ -147,8 +152,8 @@ class Renderer:
         fixed = [rigid for rigid in self._manipulators if not rigid.moves]
         clouds = [self._target.cloud, *(rigid.cloud for rigid in fixed)]
         solid = self._target.solid
-        solid.mould(self._target.mesh, AmbientLight(clouds))
-        things: list[Clay | Rigid] = [solid, *fixed]
+        solid.set_shape(self._target.mesh, AmbientLight(clouds))
+        things: list[PlasticineSurface | Rigid] = [solid, *fixed]
         return self._draw([actor for thing in things for actor in thing.actors], clouds)
 
     def close(self) -> None:
@@ -177,7 +182,7 @@ class Renderer:
         return plotter.screenshot(return_img=True)
 
     @property
-    def _things(self) -> list[Clay | Rigid | Target]:
+    def _things(self) -> list[PlasticineSurface | Rigid | Target]:
         return [*self._bodies, *self._manipulators, *([self._target] if self._target else [])]
 
     def _window(self) -> pv.Plotter:
@@ -220,7 +225,7 @@ def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:
     return _LIGHTS[0][0] @ axes
 
 
-class Clay:
+class PlasticineSurface:
     """A surface of plasticine, darker in its corners.
 
     Attributes:
@@ -233,7 +238,7 @@ class Clay:
         mesh["color"] = np.zeros((mesh.n_points, 3), np.uint8)
         self.actors = [plotter.add_mesh(mesh, scalars="color", rgb=True, smooth_shading=True, **_CLAY)]
 
-    def mould(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
+    def set_shape(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
         """Give it another shape, in the light that there is."""
         if mesh.n_points:
             light = ambient.at(mesh.points, mesh.point_normals)[:, None]
@@ -269,13 +274,13 @@ class Rigid:
         samples = [transform(m, points) for m, points in zip(matrices, self._samples, strict=True)]
         self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
 
-    def reveal(self, x: np.ndarray, camera: Camera) -> None:
+    def make_translucent(self, x: np.ndarray, camera: Camera) -> None:
         """Let it be seen through where it hides plasticine that it is at work on: particles at positions
         [domain units], shape [particle, 3]."""
-        low, high = _HIDES
+        low, high = _OCCLUSION_RANGE
         share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
         for actor in self.actors:
-            actor.prop.opacity = 1.0 - (1.0 - _CLEAREST) * share
+            actor.prop.opacity = 1.0 - (1.0 - _MIN_OPACITY) * share
 
 
 class Target:
@@ -296,7 +301,7 @@ class Target:
         is seen inside plasticine."""
         self.mesh = target_mesh(scene, mass)
         self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
-        self.solid = Clay(plotter, self.mesh.copy(), TARGET_COLOR)
+        self.solid = PlasticineSurface(plotter, self.mesh.copy(), TARGET_COLOR)
         toward = camera.position - self.mesh.points
         facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
         # Like a bubble: clear where it faces the camera, dense at the rim.
@@ -312,7 +317,7 @@ class Target:
         inside.AddActor(self.ghost[1])
         self.actors = [*self.ghost, *self.solid.actors]
 
-    def fade(self, bodies: Sequence[Field]) -> None:
+    def hide_covered_parts(self, bodies: Sequence[Field]) -> None:
         """Hide the ghost where it runs along the plasticine's surface, not where it crosses it."""
 
         def density(points: np.ndarray) -> np.ndarray:

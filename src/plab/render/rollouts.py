@@ -62,7 +62,7 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     """Return what :func:`stored` does, for this computer: on the CPU where there is no CUDA device."""
     cfg, actions = stored(path)
     if cfg.sim.device == "cuda" and not cuda_devices():
-        say("the run used CUDA, which this computer has not: replaying it on the CPU")
+        print_once("the run used CUDA, which this computer has not: replaying it on the CPU")
         cfg.sim.device = "cpu"
     return cfg, actions
 
@@ -122,7 +122,7 @@ def demonstration(cfg: Config) -> np.ndarray:
 
     scene, actions = build_scene(cfg), known_actions(cfg)
     if actions is None:
-        say(
+        print_once(
             f"no demonstration of {cfg.task.name}, variant {cfg.variant}, is known: the manipulators stay put"
         )
         return np.zeros((scene.horizon, scene.action_dim))
@@ -153,10 +153,10 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     try:
         (recording,) = _recordings([cfg], Problem([cfg]), actions[None], motion=True)
     except TargetError as error:
-        say(f"without target and scores: {error}")
+        print_once(f"without target and scores: {error}")
     else:
         if cfg.targets.source is not None:
-            say(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
+            print_once(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
         return recording
     scenes = build_scenes([cfg])
     states = list(_states(make_simulator(cfg, scenes), actions[None]))
@@ -221,6 +221,6 @@ def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str,
 
 
 @functools.cache
-def say(message: str) -> None:
+def print_once(message: str) -> None:
     """Print a message, once however many runs it is true of."""
     tell(message)

@@ -29,8 +29,8 @@ _CELL = 0.02  # of the grid of covered space
 _BLUR = 1.1  # in cells
 _CELLS_AROUND = 5
 _OPACITY = 1.5
-_LOOK_OUT = 0.03  # distance from a surface at which its light is measured
-_OWN_COVER = 0.06  # what a flat surface covers of its own view
+_SAMPLE_DISTANCE = 0.03  # distance from a surface at which its light is measured
+_FLAT_OCCLUSION = 0.06  # what a flat surface covers of its own view
 _STRENGTH = 1.1
 _VIEW_CELL = 0.02  # of the picture in which things hide each other [domain units where it looks at]
 _CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
@@ -129,6 +129,6 @@ class AmbientLight:
         Returns:
             Fractions, shape [point].
         """
-        seen = (points + _LOOK_OUT * normals - self._low) / _CELL
+        seen = (points + _SAMPLE_DISTANCE * normals - self._low) / _CELL
         covered = map_coordinates(self._covered, seen.T, order=1, mode="nearest")
-        return np.clip(1.0 - _STRENGTH * (covered - _OWN_COVER), _DARKEST, 1.0)
+        return np.clip(1.0 - _STRENGTH * (covered - _FLAT_OCCLUSION), _DARKEST, 1.0)

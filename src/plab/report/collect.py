@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import OBSERVED, Selection, one_protocol, require_possible
+from plab.config.selection import OBSERVATION_KEYS, Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
@@ -26,10 +26,10 @@ NAMES = ("task", "variant", "method", "seed")
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that the table of runs has as columns."""
 
-_SINGLE = ("seed_particles", *OBSERVED)
+_SINGLE = ("seed_particles", *OBSERVATION_KEYS)
 """Top-level configuration keys that must agree within a mean."""
 
-_HARMLESS = (
+_IGNORED_KEYS = (
     *("seed", "results_dir", "force", "progress", "logger", "checkpoint_seconds", "protocol.name"),
     *("sim.device", "sim.memory_mb", "sim.deterministic", "method.torch_device", "method.torch_threads"),
     *("method.lr_by_task", "method.contact_by_task", "method.max_gradient_norm_by_numbers"),
@@ -309,7 +309,7 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
 
 def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
     for key, values in _differences(configs).items():
-        if key not in _HARMLESS and key != apart:
+        if key not in _IGNORED_KEYS and key != apart:
             texts = " and ".join(map(str, values))
             advice = f"choose one, for example {key}={values[0]}"
             raise MixedRunsError(f"runs of {what} differ in {key}, which is {texts}: {advice}")
@@ -409,7 +409,7 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 @functools.cache
 def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     """Return the settings of plab's files for a method, a task and a protocol, by dotted key."""
-    usual = dict(_usual(method, protocol))
+    usual = dict(_default_settings(method, protocol))
     # Learning rate and contact weight may have values by task.
     for key, section, choice in (
         ("method.lr", "lr_by_task", "protocol.numbers"),
@@ -423,11 +423,11 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
         own = own | own.get("release", {})
     # Bodies, manipulators, targets and variants may be changed at will.
     usual |= {f"task.{key}": value for key, value in own.items() if not isinstance(value, dict)}
-    return {key: value for key, value in usual.items() if key not in _HARMLESS}
+    return {key: value for key, value in usual.items() if key not in _IGNORED_KEYS}
 
 
 @functools.cache
-def _usual(method: str, protocol: str) -> dict[str, Any]:
+def _default_settings(method: str, protocol: str) -> dict[str, Any]:
     """Return method, protocol and sim of plab's files, without the method where plab does not know it."""
     # Composing needs Hydra.
     from plab.config import choices, load_config

@@ -113,7 +113,7 @@ def present(shown: Shown, out: Path) -> dict[str, str]:
     return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
 
 
-def lacking(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
+def missing_pictures(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
     """Return the pictures to draw.
 
     Args:

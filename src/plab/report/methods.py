@@ -36,18 +36,18 @@ class Method:
         return "#FFFFFF" if self.colour == "#000000" else self.colour
 
 
-_LOOKS = {
+_STYLES = {
     name: Method(name, look.label, family.kind, look.colour, look.dashes)
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
 # In the order of the paper, then those that it does not have.
-_KNOWN = tuple(_LOOKS[name] for name in dict.fromkeys((*PAPER_METHODS, *_LOOKS)))
+_KNOWN = tuple(_STYLES[name] for name in dict.fromkeys((*PAPER_METHODS, *_STYLES)))
 
 
 def method(name: str) -> Method:
     """Return how a method appears; one that plab does not know is grey and belongs to no kind."""
-    return _LOOKS.get(name) or Method(name, name, "", "#777777", ":")
+    return _STYLES.get(name) or Method(name, name, "", "#777777", ":")
 
 
 _PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -70,7 +70,7 @@ def part(name: str, key: str, value: str, place: int) -> str:
     """
     whole, new = method(name), f"{name} {key}={value}"
     look = {"colour": _PALETTE[place % len(_PALETTE)], "dashes": _DASHES[place % len(_DASHES)]}
-    _LOOKS[new] = Method(new, f"{whole.label}, {key} {value}", whole.kind, of=name, **look)
+    _STYLES[new] = Method(new, f"{whole.label}, {key} {value}", whole.kind, of=name, **look)
     return new
 
 

@@ -47,7 +47,7 @@ _DIGITS = 4
 _THRESHOLDS = 51
 """Thresholds of a performance profile."""
 
-_LOOK_EVERY = 3000
+_RELOAD_INTERVAL = 3000
 """Interval at which a live page checks whether it has been written again [ms]."""
 
 _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "configuration.js", "page.js")
@@ -82,7 +82,7 @@ class Page:
             "aggregates": _aggregates(runs),
             "axes": list(AXES),
             "columns": list(_COLUMNS),
-            "every": _LOOK_EVERY,
+            "every": _RELOAD_INTERVAL,
         }
         best = {one.name: best_of_tasks([one])[one.task][1] for one in self.shown}
         self._configurations: list[dict[str, Any]] = [
@@ -286,11 +286,11 @@ def _command(config: Mapping[str, Any]) -> str:
         words.append(f"protocol={config['protocol']['name']}")
     if config["sim"]["device"] != "cpu":
         words.append(f"sim.device={config['sim']['device']}")
-    words += [f"{key}={_word(value)}" for key, value in changed_settings(config).items()]
+    words += [f"{key}={_override_text(value)}" for key, value in changed_settings(config).items()]
     return shlex.join(["plab", "run", *words])
 
 
-def _word(value: Any) -> str:
+def _override_text(value: Any) -> str:
     """Write a value as an override has it."""
     if isinstance(value, str):
         return value

@@ -25,7 +25,7 @@ from plab.results.table import Row, readable_rows, rows
 
 
 @dataclass(frozen=True)
-class Packed:
+class ArchiveSummary:
     """Summary of :func:`pack`.
 
     Attributes:
@@ -49,7 +49,7 @@ def pack(
     keep_masses: bool = False,
     keep_resume: bool = False,
     digits: int | None = None,
-) -> Packed:
+) -> ArchiveSummary:
     """Write runs into an archive, in one atomic step.
 
     Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
@@ -98,7 +98,7 @@ def pack(
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
     replace_file(archive, content, sync=True, folders=True)
-    return Packed(len(members), len(content), size, unreadable)
+    return ArchiveSummary(len(members), len(content), size, unreadable)
 
 
 def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:

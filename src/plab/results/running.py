@@ -86,17 +86,17 @@ class RunFile:
         if earlier is not None and not config["force"]:
             self._state = earlier, ()
             if lock_path(self.path).exists() or self.partial_path.exists():
-                self._clear_up()
+                self._remove_leftovers()
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock_and_resume(config["force"])
         except OSError as error:
-            self._let_go()
+            self._release_empty_folders()
             why = error.strerror or error
             raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
         except BaseException:
-            self._let_go()
+            self._release_empty_folders()
             raise
 
     def _lock_and_resume(self, force: bool) -> None:
@@ -117,7 +117,7 @@ class RunFile:
             # A run under way has a file from its start: for plab status, and as the folder may have no room.
             write(self.result, self.partial_path)
 
-    def _clear_up(self) -> None:
+    def _remove_leftovers(self) -> None:
         """Remove files left by a process that was killed just after it had finished the run."""
         # Where nothing can be removed it stays. A held lock means that the run is being computed again.
         with suppress(OSError):
@@ -136,7 +136,7 @@ class RunFile:
             if path.name.endswith((".tmp", PROGRESS_SUFFIX, *suffixes)):
                 path.unlink(missing_ok=True)
 
-    def withdraw(self) -> None:
+    def discard(self) -> None:
         """Let go of a run that is refused, and remove its files, unless it can resume from them.
 
         Files of an earlier process stay.
@@ -148,9 +148,9 @@ class RunFile:
                 else:
                     with suppress(OSError):
                         path.unlink(missing_ok=True)
-        self._let_go()
+        self._release_empty_folders()
 
-    def _let_go(self) -> None:
+    def _release_empty_folders(self) -> None:
         self.release()
         with suppress(OSError):
             # Of method, task and results, up to one that is not empty.
@@ -182,7 +182,7 @@ class RunFile:
                 self._progress.unlink(missing_ok=True)
             self._lock.release()
 
-    def spend(self, name: str, seconds: float) -> None:
+    def add_time(self, name: str, seconds: float) -> None:
         """Add to the wall time of a phase."""
         times = self._state[0].wall_time
         times[name] = times.get(name, 0.0) + seconds

@@ -131,7 +131,7 @@ class RunResult:
         its last training episodes, which explore. Methods that choose by the score themselves, such as
         planners, and those outside plab always have that of the final one.
         """
-        if counts_last(self.config):
+        if scores_last_iteration(self.config):
             return last_score(self.columns)
         return self.evaluation["score"]
 
@@ -152,7 +152,7 @@ def stored_config(text: str) -> dict[str, Any]:
     return config
 
 
-def counts_last(config: Mapping[str, Any]) -> bool:
+def scores_last_iteration(config: Mapping[str, Any]) -> bool:
     """Return whether a run's score is that of its last iteration: see :attr:`RunResult.score`."""
     own = FAMILIES.get(config["method"]["family"])
     return config["protocol"]["score"] == "last" and own is not None and own.ranking == "loss"

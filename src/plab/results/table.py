@@ -40,9 +40,9 @@ from plab.results.schema import (
     PARTIAL_SUFFIX,
     SCHEMA_VERSION,
     ResultsError,
-    counts_last,
     last_score,
     row_count,
+    scores_last_iteration,
     stored_config,
 )
 
@@ -63,7 +63,7 @@ COLUMNS = (
 
 _INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
 
-_SETTLED = 2.0
+_TIMESTAMP_RESOLUTION = 2.0
 """Age from which on a file's times identify its contents [s]: file systems round them."""
 
 
@@ -321,7 +321,7 @@ def _row(file: h5py.File, path: Path) -> Row:
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
-    if evaluation and counts_last(config):
+    if evaluation and scores_last_iteration(config):
         values["score"] = last_score(columns)
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)
 
@@ -351,7 +351,7 @@ def _indexed(root: Path, files: Mapping[Path, os.stat_result]) -> Iterator[Row |
         yield from own
         found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
         # Damaged files are read again: the message is part of the result.
-        if own and len(found) == len(own) and now - status.st_mtime >= _SETTLED:
+        if own and len(found) == len(own) and now - status.st_mtime >= _TIMESTAMP_RESOLUTION:
             kept[name] = identity, [_index_entry(path, row) for row in found]
             changed = True
     if changed or len(kept) < len(known):

@@ -50,7 +50,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
     """
     track = Track(cfg, RunFile(cfg))
     if not track.finished_before:
-        _carry_out([track], "", cache or SimulatorCache())
+        _execute_batch([track], "", cache or SimulatorCache())
     if track.error is not None:
         raise track.error
     before = "finished before" if track.finished_before else "finished"
@@ -79,7 +79,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
             status = "elsewhere" if isinstance(error, RunBusyError) else "refused"
             ended.append(Outcome.of(cfg, status, message=str(error)))
     todo = [one for one in ended if isinstance(one, Track) and not one.finished_before]
-    _carry_out(todo, note, cache or SimulatorCache())
+    _execute_batch(todo, note, cache or SimulatorCache())
     if traceback_wanted():
         # Once if it ended several runs.
         for error in {id(track.error): track.error for track in todo}.values():
@@ -91,7 +91,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
     return [one.outcome() if isinstance(one, Track) else one for one in ended]
 
 
-def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
+def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
     """Run tracks of one family to their ends; afterwards each has finished or has an error, and holds no
     lock."""
     parties = [tracks] if tracks else []

@@ -20,7 +20,7 @@ from plab.runners.policy import (
     packed,
     unpacked,
 )
-from plab.runners.training import Learned, PolicyRunner, Training
+from plab.runners.training import PolicyRunner, Training, TrainingSummary
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -136,13 +136,13 @@ class ActorTraining(Training):
     def moments(self, run: int) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
-    def hold_moments(self) -> None:
+    def freeze_moments(self) -> None:
         """Scale observations by the moments as they are now."""
         mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self.moments(0))
         self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
 
     def scaled(self, observations: torch.Tensor) -> torch.Tensor:
-        """Scale observations by the moments of the last :meth:`hold_moments`."""
+        """Scale observations by the moments of the last :meth:`freeze_moments`."""
         return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
 
     def note(self, **values: torch.Tensor | np.ndarray) -> None:
@@ -150,12 +150,12 @@ class ActorTraining(Training):
         for name, entries in values.items():
             self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
 
-    def take(self) -> list[Learned]:
+    def take(self) -> list[TrainingSummary]:
         known, self._measured = self._measured, {}
         broken, self.broken = self.broken, []
         ended, self._evaluated = self.episodes - self._evaluated, self.episodes
         means = {name: float(np.mean(known[name])) if name in known else np.nan for name in self.columns}
-        return [Learned(means, ended, broken)]
+        return [TrainingSummary(means, ended, broken)]
 
     def states(self) -> list[dict[str, Any]]:
         return [{"torch": packed(self.state())}]

@@ -72,7 +72,7 @@ class OffPolicyConfig(RlConfig):
             ranges.at_least(f"{path}.gradient_steps", self.gradient_steps, 1)
 
 
-class Draws:
+class AgentRandom:
     """Random numbers of K agents on a device; what one draws does not depend on the others."""
 
     BLOCK = 50
@@ -84,24 +84,24 @@ class Draws:
         self._device = device
         self._rest: dict[str, list[Tensor]] = {}
 
-    def _each(self, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
+    def _per_agent(self, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
         return torch.stack([draw(generator) for generator in self._generators])
 
     def normal(self, *shape: int) -> Tensor:
         """Standard normal numbers, shape [agent, ...]."""
-        return self._each(lambda g: torch.randn(shape, generator=g, device=self._device))
+        return self._per_agent(lambda g: torch.randn(shape, generator=g, device=self._device))
 
     def uniform(self, *shape: int) -> Tensor:
         """Numbers uniform in [-1, 1), shape [agent, ...]."""
-        return self._each(lambda g: torch.rand(shape, generator=g, device=self._device)) * 2.0 - 1.0
+        return self._per_agent(lambda g: torch.rand(shape, generator=g, device=self._device)) * 2.0 - 1.0
 
     def integers(self, *shape: int) -> Tensor:
         """Integers uniform in [0, :data:`LARGEST`), shape [agent, ...]."""
-        return self._each(lambda g: torch.randint(LARGEST, shape, generator=g, device=self._device))
+        return self._per_agent(lambda g: torch.randint(LARGEST, shape, generator=g, device=self._device))
 
     def permutation(self, count: int) -> Tensor:
         """The numbers below ``count`` in random order, shape [agent, count]."""
-        return self._each(lambda g: torch.randperm(count, generator=g, device=self._device))
+        return self._per_agent(lambda g: torch.randperm(count, generator=g, device=self._device))
 
     def block(self, use: str, draw: Callable[..., Tensor], *shape: int) -> Tensor:
         """Return the next entry, shape [agent, *shape], of a block for some use, which a method of this class
@@ -152,7 +152,7 @@ class Agents:
         cycle = self.cycle_steps(self.method, horizon)
         self.total_steps = whole_cycles(self.method.episodes * horizon, cycle)
         self.steps = self.updates = 0
-        self.draws = Draws([cfg.seed for cfg in cfgs], device)
+        self.draws = AgentRandom([cfg.seed for cfg in cfgs], device)
         self.networks = Networks(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._updates: dict[str, CapturedUpdate] = {}

@@ -90,7 +90,7 @@ class Cloning(Imitation):
         super().__init__(cfgs, batch)
         self.total_steps = whole_cycles(self._method.episodes * batch.horizon, len(data[0]))
         self.statistics.update(data[0].astype(np.float64))
-        self.hold_moments()
+        self.freeze_moments()
         seen, self._wanted = (torch.as_tensor(part, device=self._device) for part in data)
         self._seen = self.scaled(seen)
 

@@ -69,7 +69,7 @@ class MpcConfig(MethodConfig):
         return getattr(self.planner, "population", 1)
 
 
-class Descent(Planner):
+class GradientPlanner(Planner):
     """A gradient method as a planner of one candidate."""
 
     method: Any
@@ -115,7 +115,7 @@ class MpcRunner(PlannerRunner):
     def build(self) -> None:
         """Make the problem, with an environment per candidate."""
         super().build()
-        self._beginning = self._here()
+        self._beginning = self._current_state()
         (self._track,) = self.tracks
         self._method = self._track.cfg.method_as(MpcConfig)
 
@@ -147,7 +147,7 @@ class MpcRunner(PlannerRunner):
         kind = Replanning if taken else CandidateStart
         start = kind(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
         gradient = isinstance(method.planner, TrajectoryConfig)
-        planner = Descent(method.planner, start) if gradient else make_planner(method.planner, start)
+        planner = GradientPlanner(method.planner, start) if gradient else make_planner(method.planner, start)
         found = None if self._found is None else self._found[:, :ahead]
         spent = {True: 0, False: 0}
         for number in range(method.planner.iterations):
@@ -207,9 +207,9 @@ class MpcRunner(PlannerRunner):
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)
         self._terms += list(done.step_terms[0])
         self._executed = np.concatenate([self._executed, actions])
-        self._go_to(self._here())
+        self._go_to(self._current_state())
 
-    def _here(self) -> State:
+    def _current_state(self) -> State:
         """Return the state of the first environment, for all of them."""
         state = self.problem.simulator.state()
         arrays = {name: own for name, own in vars(state).items() if own is not None}

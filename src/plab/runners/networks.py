@@ -39,7 +39,7 @@ class Networks:
             # Of a module "a.b" the parameter "a.b.weight" is "weight", of a parameter "a" itself the name "".
             names = [n[len(modules[0]) :] for n in named[0] if f"{n}.".startswith(f"{modules[0]}.")]
             self.parts[part] = {
-                name.lstrip("."): torch.stack([_turned(own[m + name]) for own in named for m in modules])
+                name.lstrip("."): torch.stack([_transposed(own[m + name]) for own in named for m in modules])
                 .to(device)
                 .requires_grad_()
                 for name in names
@@ -60,10 +60,10 @@ class Networks:
                 for name, tensor in self.parts[part].items():
                     rows = tensor.reshape(self._count, len(modules), *tensor.shape[1:])[agent]
                     for module, row in zip(modules, rows, strict=True):
-                        own[f"{module}.{name}".rstrip(".")].copy_(_turned(row))
+                        own[f"{module}.{name}".rstrip(".")].copy_(_transposed(row))
 
 
-def _turned(parameter: Tensor) -> Tensor:
+def _transposed(parameter: Tensor) -> Tensor:
     return parameter.detach().mT if parameter.ndim == 2 else parameter.detach()
 
 

@@ -71,7 +71,7 @@ class PodsTraining(Imitation):
         if self._turns > 1:
             turn = self.episodes // (self.round_episodes[0] * batch.size)
             batch.renew(training_scenes(self._cfg, method, batch.size, turn))
-        self.hold_moments()
+        self.freeze_moments()
         before, actions = self._episode(None, "train")
         improved = self._improved(actions, method.action_lr * rate_left)
         after, _ = self._episode(improved, "plan")
@@ -80,7 +80,7 @@ class PodsTraining(Imitation):
             seen = torch.cat([before[whole], after[whole]]).flatten(0, 1)
             wanted = torch.cat([improved[whole]] * 2).flatten(0, 1)
             self.statistics.update(seen.double().cpu().numpy())
-            self.hold_moments()
+            self.freeze_moments()
             set_rate(self._optimizer, method.lr * rate_left)
             # Of each scene the last time that it was its turn.
             self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]

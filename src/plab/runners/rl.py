@@ -26,7 +26,7 @@ from plab.runners.replay import Sizes
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
 from plab.runners.tracks import RunError
-from plab.runners.training import Learned, PolicyRunner, Training
+from plab.runners.training import PolicyRunner, Training, TrainingSummary
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -105,7 +105,7 @@ class Population(Training):
         parts = zip(self.stacks, self._split(self._own(observations, 1)), strict=True)
         return torch.cat([stack.decide(part) for stack, part in parts]).squeeze(1)
 
-    def take(self) -> list[Learned]:
+    def take(self) -> list[TrainingSummary]:
         broken, ended = self._broken, self._ended
         self._broken, self._ended = {}, []
         losses = [own for stack in self.stacks for own in stack.take_losses()]
@@ -115,7 +115,7 @@ class Population(Training):
         for k, own in enumerate(losses):
             # Summed agent by agent, for the same bits in any company.
             means = {name: float(np.mean(table[:, i, k].copy())) for i, name in enumerate(self.columns)}
-            learned.append(Learned(means, len(ended) * self._envs, broken.get(k, ()), own))
+            learned.append(TrainingSummary(means, len(ended) * self._envs, broken.get(k, ()), own))
         return learned
 
     def states(self) -> list[dict[str, Any]]:

@@ -33,10 +33,10 @@ COLUMNS = ("loss", "reward", "iou", "score")
 """Columns of the results that every method has: what an episode is measured by, beside the terms of its
 loss."""
 
-LAST = ("iou", "score")
+FINAL_STATE_COLUMNS = ("iou", "score")
 """Columns that judge the last state; the others are sums over the steps."""
 
-_MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
+_STATE_ERRORS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
 """Errors of NumPy and torch at a state of other arrays."""
 
 
@@ -148,7 +148,7 @@ class Runner:
         now = time.perf_counter()
         if self._phase:
             for track in self._timed:
-                track.run.spend(self._phase, (now - self._since) / len(self._timed))
+                track.run.add_time(self._phase, (now - self._since) / len(self._timed))
         self._phase, self._since, self._timed = phase, now, list(tracks or self._timed)
 
     def actions_at_rest(self) -> np.ndarray:
@@ -223,7 +223,7 @@ class Runner:
             self.start(track, result.resume)
         except PlabError:
             raise
-        except _MISFITS as error:
+        except _STATE_ERRORS as error:
             reason, file = " ".join(str(error).split()), track.run.partial_path
             track.fail(
                 ResultsError(f"{file} cannot be gone on from: {reason[:300]}; start afresh with force=true")

@@ -33,7 +33,7 @@ from plab.envs.sb3 import PlabVecEnv
 from plab.runners.agents import LARGEST, OffPolicyConfig
 from plab.runners.policy import Policy, Spaces
 from plab.runners.replay import ReplayBuffer, Sizes
-from plab.runners.training import Learned, PolicyRunner, Training
+from plab.runners.training import PolicyRunner, Training, TrainingSummary
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ class Sb3Training(Training):
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
 
-    def take(self) -> list[Learned]:
+    def take(self) -> list[TrainingSummary]:
         ended, self._ended = self._ended, []
         values = [float(info["episode"]["r"]) for info in ended], [info["score"] for info in ended]
         means = {n: float(np.mean(v)) if v else math.nan for n, v in zip(self.columns, values, strict=True)}
         logged = self.model.logger.name_to_value.items()
         losses = {n.removeprefix("train/"): float(v) for n, v in logged if n.startswith("train/")}
-        return [Learned(means, len(ended), [i["failure"] for i in ended if "failure" in i], losses)]
+        return [TrainingSummary(means, len(ended), [i["failure"] for i in ended if "failure" in i], losses)]
 
     def states(self) -> list[dict[str, Any]]:
         model, written = self.model, io.BytesIO()

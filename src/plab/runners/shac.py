@@ -31,7 +31,7 @@ from plab.runners.libraries import torch
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
-    from plab.envs.autograd import Stretch
+    from plab.envs.autograd import PolicySteps
     from plab.envs.core import EpisodeBatch
 
 
@@ -109,7 +109,7 @@ class ShacTraining(ActorTraining):
         total = torch.zeros(batch.size, device=self._device)
         for first in range(0, batch.horizon, method.window):
             steps = min(method.window, batch.horizon - first)
-            self.hold_moments()
+            self.freeze_moments()
             self._optimizer.zero_grad()
             stretch = policy_gradient(
                 batch,
@@ -130,7 +130,7 @@ class ShacTraining(ActorTraining):
         measured = batch.problem.scores_of(batch.problem.simulator.measure(like).iou)[0]
         self.note(train_reward=total, train_score=measured)
 
-    def _learn_value(self, stretch: Stretch, rewards: torch.Tensor) -> None:
+    def _learn_value(self, stretch: PolicySteps, rewards: torch.Tensor) -> None:
         method = self._method
         seen = self.scaled(stretch.observations)
         with torch.no_grad():

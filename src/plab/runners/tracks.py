@@ -14,7 +14,7 @@ from plab.config import Config
 from plab.config.families import SOLVED, family
 from plab.errors import TRACEBACK, PlabError, tell, traceback_wanted
 from plab.results import BUDGETS, ResultsError, RunFile
-from plab.results.schema import counts_last
+from plab.results.schema import scores_last_iteration
 from plab.runners.loggers import RunLog
 
 
@@ -124,7 +124,7 @@ class Track:
         """One-line summary of a finished run: its score, and the score of its rows if that differs."""
         result = self.run.result
         text = f"score {result.score:.4f}"
-        if counts_last(result.config):
+        if scores_last_iteration(result.config):
             shown = float(result.columns["score"][-1])
             if "train_score" in result.columns and shown != result.score:
                 return f"{text} in its last training episodes ({shown:.4f} without exploration)"
@@ -159,7 +159,7 @@ class Track:
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
         if isinstance(error, ResultsError) or (is_refusal(error) and not self.run.advanced):
             # Of a ResultsError the file itself is what failed: nothing more can be written to it.
-            self.run.withdraw()
+            self.run.discard()
         elif self.run.result.rows or not is_refusal(error):
             try:
                 self.run.close("failed", describe(error))

@@ -20,12 +20,20 @@ import numpy as np
 
 from plab.config import Config, ConfigError
 from plab.config.draws import without_draws
-from plab.config.selection import OBSERVED
+from plab.config.selection import OBSERVATION_KEYS
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.libraries import torch
 from plab.runners.policy import PolicyConfig, save_policy, torch_settings
-from plab.runners.runner import LAST, Runner, SimulatorCache, Step, Track, episode_columns, simulator_key
+from plab.runners.runner import (
+    FINAL_STATE_COLUMNS,
+    Runner,
+    SimulatorCache,
+    Step,
+    Track,
+    episode_columns,
+    simulator_key,
+)
 from plab.runners.tracks import TogetherError
 
 if TYPE_CHECKING:
@@ -73,7 +81,10 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
         done = env.step(actions[-1].double().nan_to_num(), strict=False)
         failures = dict(done.failures) | failures
         values = done.info | {"reward": done.reward}
-        sums = {n: values[n] if n in LAST or n not in sums else sums[n] + values[n] for n in columns}
+        sums = {
+            n: values[n] if n in FINAL_STATE_COLUMNS or n not in sums else sums[n] + values[n]
+            for n in columns
+        }
         observations = done.observation
     # From the device at once.
     rows = torch.stack([sums[name] for name in columns]).cpu().numpy().T
@@ -102,7 +113,7 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
     for cfgs, contact in kinds:
         cfg = cfgs[0]
         key += [simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, len(cfgs), contact]
-        key += [getattr(cfg, name) for name in OBSERVED]
+        key += [getattr(cfg, name) for name in OBSERVATION_KEYS]
     return cache.get(
         tuple(key),
         lambda: [EpisodeBatch(cfgs, contact=contact) for cfgs, contact in kinds],
@@ -111,7 +122,7 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
 
 
 @dataclass
-class Learned:
+class TrainingSummary:
     """Training of a policy since its last evaluation.
 
     Attributes:
@@ -138,7 +149,7 @@ class Training(ABC):
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
-    """Measures of :class:`Learned`."""
+    """Measures of :class:`TrainingSummary`."""
 
     round_episodes: tuple[int, int] = 1, 0
     """Episodes of an environment in a cycle, and those of them with gradient."""
@@ -177,7 +188,7 @@ class Training(ABC):
         entry]."""
 
     @abstractmethod
-    def take(self) -> list[Learned]:
+    def take(self) -> list[TrainingSummary]:
         """Return each policy's training since the last call."""
 
     @abstractmethod
@@ -348,7 +359,7 @@ def _replay_path(track: Track) -> Path:
     return track.run.path.with_suffix(REPLAY_SUFFIX)
 
 
-def _unusable(track: Track, learned: Learned, done: Evaluation) -> str:
+def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
     """Return why a run cannot go on, or an empty text; count episodes that broke off in the result's
     provenance, and warn of them."""
     broken = learned.broken

@@ -21,7 +21,7 @@ from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule, family
 from plab.runners.runner import Runner, Step, Track, measures, shared_problem
 
-CHECK = 10
+CHECK_INTERVAL = 10
 """Iterations after which the best actions since the last check are run in the hard contact model."""
 
 
@@ -137,7 +137,7 @@ class TrajectoryRunner(Runner):
             )
 
     def _is_due(self, track: Track) -> bool:
-        return (track.iteration + 1) % CHECK == 0 or track.iteration + 1 == self.iterations(track)
+        return (track.iteration + 1) % CHECK_INTERVAL == 0 or track.iteration + 1 == self.iterations(track)
 
     def _check(self, tracks: Sequence[Track]) -> dict[Track, int]:
         """Score finalists of some runs in the hard contact model; return the rollouts of each run."""

@@ -46,7 +46,7 @@ else:
 # -- definitions of kernels ---------------------------------------------------------------------------------
 
 
-def _tell_classes_quickly() -> None:
+def _skip_source_search() -> None:
     """Let Taichi's decorators tell functions from methods without a search for the source: patches
     ``kernel_impl._inside_class``.
 
@@ -66,13 +66,13 @@ def _tell_classes_quickly() -> None:
 
 
 if not QUADRANTS:
-    _tell_classes_quickly()
+    _skip_source_search()
 
 
 # -- compiling ----------------------------------------------------------------------------------------------
 
 
-def hasten_tracing() -> None:
+def defer_position_lookup() -> None:
     """Look up the place of an AST node only once there is an error to report: patches
     ``ASTTransformerContext.get_pos_info``.
 
@@ -107,7 +107,7 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
         # Quadrants traces a kernel twice.
         if isinstance(function, Kernel) and "launch_kernel" not in vars(function):
             tell(function.func.__name__)
-            _tell_after_launch(function, tell)
+            _notify_after_launch(function, tell)
         return original(function, *args, **kwargs)
 
     setattr(_traced, _TRACE, entry)
@@ -117,7 +117,7 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
         setattr(_traced, _TRACE, original)
 
 
-def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
+def _notify_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 
     def launch(*args: Any, **kwargs: Any) -> Any:
         # Only of this launch: the attribute hides the method.
@@ -133,7 +133,7 @@ def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 # -- memory -------------------------------------------------------------------------------------------------
 
 
-def forget_arguments() -> None:
+def clear_kernel_arguments() -> None:
     """Let kernels forget what they were called with before Taichi started anew: clears ``Kernel.mapper``.
 
     Taichi's own kernels would hold all fields that they have ever filled or read, some 100 kB of a simulator.
@@ -142,7 +142,7 @@ def forget_arguments() -> None:
         kernel.mapper.mapping.clear()
 
 
-def free_own_arrays_only() -> None:
+def guard_array_release() -> None:
     """Let arrays of before Taichi started anew free nothing when Python forgets them: patches
     ``ScalarNdarray.__init__`` and ``__del__``.
 

@@ -20,21 +20,22 @@ from plab.sim.term_phases import TermPhases
 
 BLOCK_NODES = BLOCK**3
 
-SPLIT = 512
-"""Taichi hands out CPU loops in chunks of at least this many iterations; one iteration in each does a
-thread's work."""
+MIN_TASK_SIZE = 512
+"""Least number of iterations that Taichi schedules as one CPU task; every ``MIN_TASK_SIZE``-th iteration does
+the work of a thread."""
 
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
 
 PROBE_FIRST, PROBE = 16, 100
-"""The slower team is tried again at this launch, after as many more, and in the end every so many."""
+"""Launches after which the slower team is timed again: first interval, doubled each time, and largest
+interval."""
 
-RECENT = 3
-"""A team is as fast as the fastest of so many of its launches: one that was interrupted says little."""
+TIMED_LAUNCHES = 3
+"""Number of launches timed per team; the fastest counts, because launches can be interrupted."""
 
-CLEARLY = 1.5
-"""A team that takes so many times as long as the first one is not tried ``RECENT`` times at the start."""
+SLOW_TEAM_RATIO = 1.5
+"""A team slower than the first one by this factor is initially timed only once."""
 
 
 class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
@@ -108,15 +109,15 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         """Material update, and scatter of momentum and mass; on the way back (``adjoint``) without update,
         and with scatter of the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * STENCILS)
-        bases_at = self.bounded(grid_index * BASES)
+        at = self.masked_index(grid_index * STENCILS)
+        bases_at = self.masked_index(grid_index * BASES)
         known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = self.bounded((e * self.tiles + tile) * 9)
-            at_strains = self.bounded(grid_index * STRAINS)
+            entry9 = self.masked_index((e * self.tiles + tile) * 9)
+            at_strains = self.masked_index(grid_index * STRAINS)
             self.material_tile(state, state_at, source, target, entry9, e, at_strains, not adjoint)
             self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
@@ -127,7 +128,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                node = self.bounded(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
+                node = self.masked_index(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
                 self.scatter_momentum(entry9, lane, node, at)
                 if ti.static(adjoint):
                     self.scatter_adjoint(bar_at, entry, lane, node, at)
@@ -162,14 +163,14 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
     def gather_chunk(self, state: ti.template(), state_at, before, after, e, c, time):
         """Velocities, affine matrices and positions after the substep."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * STENCILS)
-        bases_at = self.bounded(grid_index * BASES)
+        at = self.masked_index(grid_index * STENCILS)
+        bases_at = self.masked_index(grid_index * BASES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             self.stencil_tile(state, source, at, bases_at, False)
             for lane in range(self.lanes_of(tile)):
-                node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
+                node = self.masked_index(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle(state_at, source, target, lane, node, e, time, at)
 
     @ti.func
@@ -195,21 +196,29 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
     ):
         """Adjoints of the particles before the substep."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * STENCILS)
-        bases_at = self.bounded(grid_index * BASES)
+        at = self.masked_index(grid_index * STENCILS)
+        bases_at = self.masked_index(grid_index * BASES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            entry9 = self.masked_index((e * self.tiles + tile) * 9)
             self.stencil_tile(state, source, at, bases_at, True)
             self.momentum_tile(state, source, entry9, at)
             self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
-                node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
+                node = self.masked_index(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle_adjoint(state_at, source, target, bar_at, entry, entry9, lane, node, at)
             self.material_tile_adjoint(
-                state, state_at, source, bar, bar_at, entry, entry9, e, self.bounded(grid_index * STRAINS)
+                state,
+                state_at,
+                source,
+                bar,
+                bar_at,
+                entry,
+                entry9,
+                e,
+                self.masked_index(grid_index * STRAINS),
             )
 
     # -- poses --------------------------------------------------------------------------------------
@@ -270,11 +279,11 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                 self.scatter_mass(grid_index, base, fx)
                 if ti.static(len(self.particle_terms) > 0):
                     part += self.particle_measures(e, x, self.vector(state, source + AT_V, lane))
-                self.tally_distances(e, c, tile * self.lanes + lane, x)
+                self.accumulate_distances(e, c, tile * self.lanes + lane, x)
         self.particle_part[e, c] = part
 
     @ti.func
-    def tally_distances(self, e, c, particle, x):
+    def accumulate_distances(self, e, c, particle, x):
         """Add a particle of a chunk to the tallies of its distances."""
         if ti.static(len(self.distance_terms) > 0):
             for shape, start, stop in ti.static(self.shape_ranges):
@@ -350,7 +359,7 @@ class TeamChoice:
 
     def __init__(self, sizes: Sequence[int]) -> None:
         """Start with the first team, of so many threads; the others are tried in their order."""
-        self._seconds: dict[int, deque[float]] = {size: deque(maxlen=RECENT) for size in sizes}
+        self._seconds: dict[int, deque[float]] = {size: deque(maxlen=TIMED_LAUNCHES) for size in sizes}
         self._launches, self._probe_at = 0, PROBE_FIRST
 
     def run(self, kernel: Callable, args: tuple) -> None:
@@ -366,9 +375,9 @@ class TeamChoice:
     def _next(self) -> int:
         fastest = {size: min(seconds, default=0.0) for size, seconds in self._seconds.items()}
         tried = {size: len(seconds) for size, seconds in self._seconds.items()}
-        limit = CLEARLY * next(iter(fastest.values()))
+        limit = SLOW_TEAM_RATIO * next(iter(fastest.values()))
         # As many launches of each at first: the first ones of a process are often interrupted.
-        if wanted := [size for size in fastest if tried[size] < RECENT and fastest[size] <= limit]:
+        if wanted := [size for size in fastest if tried[size] < TIMED_LAUNCHES and fastest[size] <= limit]:
             return min(wanted, key=tried.__getitem__)
         if self._launches >= self._probe_at:
             self._probe_at += min(self._launches, PROBE)
@@ -481,10 +490,10 @@ class CpuEngine(CpuPhases):
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
-        for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < teams * size:
-                team = q // SPLIT // size
-                rank = q // SPLIT % size
+        for q in range(self.threads * MIN_TASK_SIZE):
+            if q % MIN_TASK_SIZE == 0 and q // MIN_TASK_SIZE < teams * size:
+                team = q // MIN_TASK_SIZE // size
+                rank = q // MIN_TASK_SIZE % size
                 for turn in range((self.batch - team + teams - 1) // teams):
                     e = team + turn * teams
                     if rank == 0:
@@ -524,10 +533,10 @@ class CpuEngine(CpuPhases):
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
-        for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < teams * size:
-                team = q // SPLIT // size
-                rank = q // SPLIT % size
+        for q in range(self.threads * MIN_TASK_SIZE):
+            if q % MIN_TASK_SIZE == 0 and q // MIN_TASK_SIZE < teams * size:
+                team = q // MIN_TASK_SIZE // size
+                rank = q // MIN_TASK_SIZE % size
                 for turn in range((self.batch - team + teams - 1) // teams):
                     e = team + turn * teams
                     entry = at + ti.static(self.measures) * e
@@ -561,10 +570,10 @@ class CpuEngine(CpuPhases):
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
-        for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < teams * size:
-                team = q // SPLIT // size
-                rank = q // SPLIT % size
+        for q in range(self.threads * MIN_TASK_SIZE):
+            if q % MIN_TASK_SIZE == 0 and q // MIN_TASK_SIZE < teams * size:
+                team = q // MIN_TASK_SIZE // size
+                rank = q // MIN_TASK_SIZE % size
                 for turn in range((self.batch - team + teams - 1) // teams):
                     e = team + turn * teams
                     end = slot + self.substeps

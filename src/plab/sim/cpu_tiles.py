@@ -109,7 +109,7 @@ class TilePhases(ParticlePhases):
         self.mark_count = ti.field(ti.i32, shape=grids)
 
     @ti.func
-    def bounded(self, index):
+    def masked_index(self, index):
         """An index, the same: one of which LLVM can tell that sums with it do not overflow.
 
         So it computes one address for all that lies at fixed distances, and finds neighbours to be

@@ -28,7 +28,7 @@ RESIDENT_BLOCKS = 2
 RESIDENT_TURNS = 4
 """Up to so many particles per resident thread a step is one launch, and so is its adjoint."""
 
-PARTS_MOST = 4
+MAX_TILE_WARPS = 4
 """Warps that share a tile's particles there, at most."""
 
 RESERVED = 1024
@@ -74,13 +74,13 @@ class CudaEngine(CudaPhases):
         self.resident_threads = blocks * RESIDENT_BLOCK
         self.last_arrival = ctypes.c_int32((1 << 31) - (blocks - 1)).value
         # Few particles are shared out to more warps, each of which is sooner done with fewer.
-        self.parts = max(1, min(PARTS_MOST, self.resident_threads // self.particle_threads))
+        self.parts = max(1, min(MAX_TILE_WARPS, self.resident_threads // self.particle_threads))
         self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
         self.mass_blocks = ti.field(ti.i32, shape=1)
 
     @property
-    def tally_threads(self) -> int:
+    def reduction_threads(self) -> int:
         """Threads that tally distances."""
         return DISTANCE_GROUPS * self.batch * self.manipulators if self.distance_terms else 0
 
@@ -181,10 +181,10 @@ class CudaEngine(CudaPhases):
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread(state, before, before + stride, q, time, stamp, self.parts)
-                self.meet(w)
+                self.barrier_all(w)
                 for turn in range(self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
-                self.meet(w)
+                self.barrier_all(w)
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, time, self.parts)
@@ -203,7 +203,7 @@ class CudaEngine(CudaPhases):
             particle = tile * self.lanes + lane
             self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
         ti.loop_config(block_dim=WARP_BLOCK)
-        for w in range(self.node_threads + self.tally_threads):
+        for w in range(self.node_threads + self.reduction_threads):
             if w < self.node_threads:
                 for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                     self.node_terms_thread(w, w + turn * self.node_threads)
@@ -214,7 +214,7 @@ class CudaEngine(CudaPhases):
                 for shape, start, stop in ti.static(self.shape_ranges):
                     if ti.static(self.acts(shape)):
                         if start <= m < stop:
-                            self.tally_group(e, m, q % DISTANCE_GROUPS)
+                            self.reduce_distances(e, m, q % DISTANCE_GROUPS)
         for e in range(self.batch):
             self.take_measures(e)
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
@@ -272,10 +272,10 @@ class CudaEngine(CudaPhases):
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp, self.parts)
-                self.meet(w)
+                self.barrier_all(w)
                 for turn in range(self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))):
                     self.grid_thread_adjoint(w, w + turn * self.resident_threads, s)
-                self.meet(w)
+                self.barrier_all(w)
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread_adjoint(state, bar, before, before + 1, q, self.parts)

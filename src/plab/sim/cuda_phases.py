@@ -38,7 +38,7 @@ RESIDENT_BLOCK = WARP_BLOCK
 """Threads of a block of the step that is one launch: Taichi gives them no more registers than two blocks of a
 multiprocessor have."""
 
-FEW = 6
+MAX_TESTED_MANIPULATORS = 6
 """Manipulators of which each node tests all; of more, a block's warps ask first which can reach the block."""
 
 POSE_SHARE = 8
@@ -337,7 +337,7 @@ class CudaPhases(OrderPhases, PosePhases):
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 asked = 1
-                if ti.static(self.manipulators > FEW):
+                if ti.static(self.manipulators > MAX_TESTED_MANIPULATORS):
                     asked = near & (1 << m)
                 if asked:
                     p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
@@ -423,7 +423,7 @@ class CudaPhases(OrderPhases, PosePhases):
                     self.distance[at] = self.end_distance(shape, e, m, x)
 
     @ti.func
-    def tally_group(self, e, m, group):
+    def reduce_distances(self, e, m, group):
         """Tally the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator, and join what the
         lanes of a warp have tallied; all lanes of a warp take part."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
@@ -488,7 +488,7 @@ class CudaPhases(OrderPhases, PosePhases):
                 self.set_frame(q % self.batch, number // count, q // self.batch)
 
     @ti.func
-    def meet(self, w):
+    def barrier_all(self, w):
         """Wait until all resident threads are here, and have written what they write."""
         ti.simt.block.sync()
         if w % RESIDENT_BLOCK == 0:
@@ -509,7 +509,7 @@ class CudaPhases(OrderPhases, PosePhases):
         ``time`` is noted where the state is broken by what an integer cannot hold.
         """
         e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q, parts)
-        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
+        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
@@ -531,7 +531,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def scatter_mass_thread(self, q, e, base, fx, node, stamp):
         """Add the mass of thread q's particle to its 27 nodes as :meth:`scatter_mass` does; all lanes of a
         warp take part."""
-        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
+        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
         rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
@@ -550,7 +550,7 @@ class CudaPhases(OrderPhases, PosePhases):
         total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
         # A test of which of a few manipulators are near would cost a thread as much as contact with them.
         near = (1 << self.manipulators) - 1
-        if ti.static(self.manipulators > FEW):
+        if ti.static(self.manipulators > MAX_TESTED_MANIPULATORS):
             near = self.near_block(w, e, s, block)
         v = self.update_node(e, e, s, self.node_of_block(block, r), near, total)
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
@@ -564,7 +564,7 @@ class CudaPhases(OrderPhases, PosePhases):
         e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q, parts)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
-        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
+        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
@@ -595,7 +595,7 @@ class CudaPhases(OrderPhases, PosePhases):
         unit = self.adjoint_scale(e, -1)
         bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r, unit)
         near = 0
-        if ti.static(self.manipulators > FEW):
+        if ti.static(self.manipulators > MAX_TESTED_MANIPULATORS):
             near = self.near_block(w, e, s, block)
         if total[3] > MASS_MIN:
             near = self.touching(e, s, self.position(i), near)

@@ -17,7 +17,7 @@ from typing import Any
 
 from plab.sim.codegen.bitcode import bitcode_file, symbol
 from plab.sim.compiler import bitcode_function, local_variable, ti
-from plab.sim.particle_phases import ENDINGS
+from plab.sim.particle_phases import TYPE_SUFFIXES
 from plab.sim.storage import Storage
 
 MOMENTUM_BITS, MASS_BITS = 36, 42
@@ -45,7 +45,7 @@ LEAST_EXPONENT = -80
 
 def atomic(name: str, kind: Any) -> Callable[..., None]:
     """Return a function of ``cuda_global.ll`` for numbers of a type."""
-    return bitcode_function(bitcode_file("cuda", "", "atomics"), symbol("atomics", name, ENDINGS[kind]))
+    return bitcode_function(bitcode_file("cuda", "", "atomics"), symbol("atomics", name, TYPE_SUFFIXES[kind]))
 
 
 @ti.func

@@ -58,7 +58,7 @@ def packed(a, b):
 
 
 @ti.func
-def within(at):
+def masked_index(at):
     """An index of shared memory, of which LLVM can tell that sums with it do not wrap: with a constant they
     cost nothing."""
     return at & SHARED_MASK
@@ -228,7 +228,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         return packed & (self.lanes - 1), packed < self.nodes * self.lanes
 
     @ti.func
-    def heads_of(self, key, taking_part, lane):
+    def run_heads(self, key, taking_part, lane):
         """The runs of neighbouring lanes with the same key in a warp. Of a run all lanes take part or none,
         and those that do are the warp's first.
 
@@ -269,7 +269,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         numbers. Then the lanes are the components of the nine columns of a run's stencil, and each sums what
         the run's particles give to its three nodes. The sums change lanes once more, so that neighbours add
         neighbouring numbers to the grid: the device takes up to 8 of them at once. ``heads`` and ``taking``
-        are those of :meth:`heads_of` for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_grid`.
+        are those of :meth:`run_heads` for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_grid`.
         If ``folded``, nodes are those of :meth:`folded_node`; ``folds`` has a bit for each axis along which
         the base node is the first.
         """
@@ -279,7 +279,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         sloping = ti.static([c for c in components if c < 3])
         last = ti.static(3 * len(sloping))
         plane = ti.static(last + (1 if 3 in components else 0))
-        own = within(corner + lane * ROW_STRIDE)
+        own = masked_index(corner + lane * ROW_STRIDE)
         for i in ti.static(range(3)):
             for c in ti.static(sloping):
                 rows[own + plane * i + 3 * c] = w[i][0] * (field[0][c] + float(i) * field[1][c])
@@ -311,10 +311,10 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
             total = ti.Vector.zero(self.real, 4)
             for p in range(begin, end):
                 row = p * ROW_STRIDE
-                at = within(from_share + row)
+                at = masked_index(from_share + row)
                 shares = ti.Vector([rows[at], rows[at + 1], rows[at + 2]])
                 if ti.static(len(sloping) > 0):
-                    at = within(from_field + row)
+                    at = masked_index(from_field + row)
                     value = rows[at] + y * rows[at + 1]
                     slope = rows[at + 2]
                     total[0] += shares[0] * value
@@ -324,12 +324,12 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                     total[2] += shares[2] * value
                 if ti.static(3 in components):
                     share = ti.select(k == 0, shares[0], ti.select(k == 1, shares[1], shares[2]))
-                    total[3] += share * rows[within(from_plane + row) + last]
+                    total[3] += share * rows[masked_index(from_plane + row) + last]
             if ti.static(len(sloping) > 0):
                 for c in ti.static(range(3)):
-                    rows[within(sums + (column + c) * width + k)] = total[c]
+                    rows[masked_index(sums + (column + c) * width + k)] = total[c]
             if ti.static(3 in components):
-                rows[within(sums + (column + k) * width + width - 1)] = total[3]
+                rows[masked_index(sums + (column + k) * width + width - 1)] = total[3]
             self.wait_for_warp()
             head = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), node, begin)
             base = self.node_at(first, head)
@@ -345,7 +345,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                     if ti.static(folded):
                         offset = ti.max(offset, least)
                     component = ti.static(components[0]) + number % width
-                    share = rows[within(sums + number)]
+                    share = rows[masked_index(sums + number)]
                     self.add_to_grid(base, 4 * self.linear(offset) + component, component, share, scale)
             self.wait_for_warp()
 

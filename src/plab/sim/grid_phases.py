@@ -29,7 +29,7 @@ STICKING = 10.0
 
 
 @ti.func
-def slid(t, rn, friction):
+def with_friction(t, rn, friction):
     """Tangential velocity t, a 3-vector or 2-vector in the surface's own axes, after full contact: shortened
     by friction times the normal velocity rn that is lost, which is negative, towards the surface."""
     length = t.norm()
@@ -40,7 +40,7 @@ def slid(t, rn, friction):
 
 
 @ti.func
-def slid_adjoint(t, rn, friction, bar):
+def with_friction_adjoint(t, rn, friction, bar):
     length = t.norm()
     t_bar = t * 0.0
     rn_bar = 0.0 * rn
@@ -157,7 +157,7 @@ class GridPhases(Storage):
             r = v - u
             rn = r.dot(normal)
             if rn < 0.0:
-                t = slid(r - rn * normal, rn, self.friction[e, m])
+                t = with_friction(r - rn * normal, rn, self.friction[e, m])
                 out = u + (1.0 - strength) * r + strength * t
         return out
 
@@ -182,8 +182,8 @@ class GridPhases(Storage):
             if rn < 0.0:
                 friction = self.friction[e, m]
                 t0 = r - rn * normal
-                t = slid(t0, rn, friction)
-                t0_bar, rn_bar = slid_adjoint(t0, rn, friction, bar)
+                t = with_friction(t0, rn, friction)
+                t0_bar, rn_bar = with_friction_adjoint(t0, rn, friction, bar)
                 t0_bar *= strength
                 rn_bar *= strength
                 rn_bar -= normal.dot(t0_bar)
@@ -248,7 +248,7 @@ class GridPhases(Storage):
         """Velocity after the floor, for a floor node with v_y < 0."""
         out = v * 0.0
         if friction < STICKING:
-            t = slid(ti.Vector([v[0], v[2]]), v[1], friction)
+            t = with_friction(ti.Vector([v[0], v[2]]), v[1], friction)
             out[0] = t[0]
             out[2] = t[1]
         return out
@@ -257,12 +257,14 @@ class GridPhases(Storage):
     def floor_adjoint(self, v, friction, bar):
         out = v * 0.0
         if friction < STICKING:
-            t_bar, vy_bar = slid_adjoint(ti.Vector([v[0], v[2]]), v[1], friction, ti.Vector([bar[0], bar[2]]))
+            t_bar, vy_bar = with_friction_adjoint(
+                ti.Vector([v[0], v[2]]), v[1], friction, ti.Vector([bar[0], bar[2]])
+            )
             out = ti.Vector([t_bar[0], vy_bar, t_bar[1]])
         return out
 
     @ti.func
-    def rubs(self, i, v, friction):
+    def has_floor_friction(self, i, v, friction):
         """Return True if the floor acts on a node, beyond stopping it as any wall does."""
         return friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
 
@@ -270,7 +272,7 @@ class GridPhases(Storage):
     def walls(self, i, v, friction):
         """Velocity of a node after walls and floor, axis by axis."""
         v1 = self.wall_free(i, v, 0)
-        if self.rubs(i, v1, friction):
+        if self.has_floor_friction(i, v1, friction):
             v1 = self.floor(v1, friction)
         else:
             v1 = self.wall_free(i, v1, 1)
@@ -280,7 +282,7 @@ class GridPhases(Storage):
     def walls_adjoint(self, i, v, friction, bar):
         v1 = self.wall_free(i, v, 0)
         v2 = v1
-        floored = self.rubs(i, v1, friction)
+        floored = self.has_floor_friction(i, v1, friction)
         if floored:
             v2 = self.floor(v1, friction)
         out = self.wall_free_adjoint(i, v2, bar, 2)

@@ -25,7 +25,7 @@ from plab.sim.tensors import Array
 SIZES = {ti.f32: 4, ti.f64: 8}
 """Bytes of a number."""
 
-ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
+TYPE_SUFFIXES = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
 """Endings of the names of functions of bitcode."""
 
 
@@ -89,7 +89,7 @@ class ParticlePhases(Storage):
         part = self.laws[unit] if isinstance(unit, int) else unit
         precision = "f32" if self.real == ti.f32 else "f64"
         path = bitcode_file(self.code_device, precision, part, len(self.laws) > 1)
-        return bitcode_function(path, symbol(part, name, ENDINGS[real] if real else precision))
+        return bitcode_function(path, symbol(part, name, TYPE_SUFFIXES[real] if real else precision))
 
     def scheduled(self, number: int) -> bool:
         """Return True if a law has a schedule of its own, with singular values beyond its series' range."""

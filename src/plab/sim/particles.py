@@ -191,7 +191,7 @@ class Particles:
         """Bytes of one state of all environments."""
         return self.slot_entries * np.dtype(self._numpy_real).itemsize
 
-    def take_stamps(self, count: int) -> int:
+    def new_stamps(self, count: int) -> int:
         """The first of ``count`` fresh stamps, which tell the marks of one scatter from those before."""
         if self._stamp + count >= STAMP_MAX:
             self.engine.block_stamp.fill(0)
@@ -216,7 +216,7 @@ class Particles:
         another; ``moves`` keeps the step's order of the particles, if it is needed later."""
         if self.engine.sorts:
             entry = 0 if moves is None else t
-            self.order.sort(self.current, 0, self._spare, 0, entry, self.take_stamps(1), moves)
+            self.order.sort(self.current, 0, self._spare, 0, entry, self.new_stamps(1), moves)
             self.current, self._spare = self._spare, self.current
         self.advance(self.current, 0, 0, poses, actions, t, entries)
 
@@ -231,13 +231,13 @@ class Particles:
         entries: tuple[int, int],
     ) -> None:
         """Environment step t from a time slot of ``state``, by ``stride`` slots per substep (0: in place)."""
-        stamp = self.take_stamps(self.engine.substeps)
+        stamp = self.new_stamps(self.engine.substeps)
         self.engine.step(state, poses, actions, slot, stride, t, *entries, stamp)
 
     def losses(self, terms: ti.Ndarray, at: int, state: ti.Ndarray | None = None, slot: int = 0) -> None:
         """Write the measures of a state, the current one by default, to ``terms`` from entry ``at``."""
         state = self.current if state is None else state
-        self.engine.losses(state, slot, terms, at, self.take_stamps(1))
+        self.engine.losses(state, slot, terms, at, self.new_stamps(1))
 
     # -- to and from the host -----------------------------------------------------------------------
 

@@ -18,17 +18,17 @@ from plab.errors import ArgumentError, PlabError
 from plab.scenes import DEVICES, PRECISIONS
 from plab.sim.compiler import (
     cache_lock,
+    clear_kernel_arguments,
     cuda_available,
-    forget_arguments,
-    free_own_arrays_only,
-    hasten_tracing,
+    defer_position_lookup,
+    guard_array_release,
     ti,
 )
 
 CACHE_BYTES = 1 << 30
 """Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
 
-ABANDONED_SECONDS = 10.0
+STALE_LOCK_SECONDS = 10.0
 """Age from which the lock of Taichi's cache is a killed process's: it is held while files are written."""
 
 
@@ -129,11 +129,11 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     _users.clear()
     # Taichi announces the device on standard output, which belongs to the caller.
     with contextlib.redirect_stdout(io.StringIO()):
-        free_abandoned_cache()
+        remove_stale_cache_lock()
         _start_taichi(device, precision, wanted)
-    forget_arguments()
-    free_own_arrays_only()
-    hasten_tracing()
+    clear_kernel_arguments()
+    guard_array_release()
+    defer_position_lookup()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
 
@@ -149,14 +149,14 @@ def _refuse_fork() -> None:
     _process = os.getpid()
 
 
-def free_abandoned_cache() -> None:
+def remove_stale_cache_lock() -> None:
     """Remove the lock that a process killed while it wrote compiled kernels has left in Taichi's cache.
 
     Taichi waits for it a fifth of a second, and would then compile every kernel anew in every later process.
     """
     lock = cache_lock()
     with contextlib.suppress(OSError):
-        if time.time() - lock.stat().st_mtime > ABANDONED_SECONDS:
+        if time.time() - lock.stat().st_mtime > STALE_LOCK_SECONDS:
             lock.unlink()
 
 

@@ -37,7 +37,7 @@ from plab.sim.term_phases import LossTerm
 if TYPE_CHECKING:
     import torch
 
-    from plab.kinematics.actions import Drive
+    from plab.kinematics.actions import LinkMotion
 
 
 class Simulator:
@@ -132,7 +132,7 @@ class Simulator:
         self._tape = Tape(self._particles)
         self._starts = Starts(self._engine)
         self._initial = self._particles.array(1)
-        self._drive: Drive | None = None
+        self._drive: LinkMotion | None = None
         self._joints: Any = None
         self._initial_joints: np.ndarray | None = None
         self._start_from(particles)
@@ -644,7 +644,7 @@ class Simulator:
             self.action_dim,
             follow,
         )
-        loop.look(0, self._particles.current, 0)
+        loop.observe_step(0, self._particles.current, 0)
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         before = self.steps_before_contact(steps)
@@ -652,7 +652,7 @@ class Simulator:
             self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
         bars = numbers_of(loop.actions_bar, (steps, self.batch, self._engine.actions_per_step), like)
         require_none(broken_gradients(bars.swapaxes(0, 1)))
-        loop.answer(0)
+        loop.react_at(0)
         self._engine.place(poses, steps, self._pose, 0)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), like)
         return self._judged(values).terms[1:].swapaxes(0, 1)
@@ -735,7 +735,7 @@ class Simulator:
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         return array, steps, self._pose_history(steps, self._initial_poses), plan
 
-    def _follow(self, actions: Any, gradient: bool = True) -> Drive:
+    def _follow(self, actions: Any, gradient: bool = True) -> LinkMotion:
         """Apply actions, shape [T, batch, A], to the joints of the articulated models."""
         assert self._map is not None
         self._drive = self._map.drive(self._joints, actions, gradient)
@@ -743,7 +743,7 @@ class Simulator:
         return self._drive
 
     def _by_actions(
-        self, bars: ti.Ndarray, steps: int, like: Any, drive: Drive | None
+        self, bars: ti.Ndarray, steps: int, like: Any, drive: LinkMotion | None
     ) -> np.ndarray | torch.Tensor:
         """Convert derivatives with respect to manipulator motions to derivatives with respect to actions,
         shape [batch, T, A]."""

@@ -55,8 +55,7 @@ class Starts:
 
     @ti.kernel
     def place_at_rest(self, target: Array, e: ti.i32, order: Array, x: Array):
-        """Write particles at rest to an environment's state, given the number of the particle at each place.
-        """
+        """Write particles at rest to an environment's state, given the particle number of each place."""
         for place in range(self.engine.particles):
             entry = self.engine.tile_entry(0, e, place // self.engine.lanes)
             lane = place % self.engine.lanes

@@ -20,7 +20,7 @@ from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, st
 if TYPE_CHECKING:
     import torch
 
-    from plab.kinematics.actions import Drive
+    from plab.kinematics.actions import LinkMotion
 
 
 class Tape:
@@ -63,8 +63,8 @@ class Tape:
 
     def _place(self, t: int) -> tuple[ti.Ndarray, int]:
         """Array and slot of the history from which step t starts."""
-        number, within = divmod(t % self._length, self._reach)
-        return self._history[number], within * self._slots_per_step + (1 if self._engine.sorts else 0)
+        number, masked_index = divmod(t % self._length, self._reach)
+        return self._history[number], masked_index * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
         """Return :func:`plab.sim.memory.segment_length` for a gradient of T ``steps``, within a budget for
@@ -155,15 +155,15 @@ class Tape:
     def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
         """Run step t within the history; ``known`` tells that its order of the particles is."""
         history, slot = self._place(t)
-        number, within = divmod(t % self._length, self._reach)
-        if number and not within:
+        number, masked_index = divmod(t % self._length, self._reach)
+        if number and not masked_index:
             end = self._reach * self._slots_per_step
             self._engine.copy_slot(self._history[number - 1], end, history, 0)
         if self._engine.sorts:
             if known:
                 self._engine.move(history, slot - 1, history, slot, self._moves, t)
             else:
-                stamp = self._particles.take_stamps(1)
+                stamp = self._particles.new_stamps(1)
                 self._particles.order.sort(history, slot - 1, history, slot, t, stamp, self._moves)
         self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1))
 
@@ -211,7 +211,7 @@ class Tape:
             if add is not None:
                 add(t, history, slot + engine.substeps, self.bar)
             entry, contact = self._entry(t), int(t >= contact_free)
-            stamp = self._particles.take_stamps(engine.substeps + 1)
+            stamp = self._particles.new_stamps(engine.substeps + 1)
             engine.step_adjoint(
                 history, self.bar, poses, actions, actions_bar, terms, entry, slot, t, stamp, contact
             )
@@ -376,7 +376,7 @@ class ClosedLoop:
         discount: float,
         like: torch.Tensor | None,
         components: int,
-        follow: Callable[[Any], Drive] | None,
+        follow: Callable[[Any], LinkMotion] | None,
     ) -> None:
         """Start before the first of T ``steps``; ``observe`` observes a time slot of an array, ``follow``
         moves the joints of articulated models by actions of so many ``components``, the rest is as in
@@ -386,7 +386,7 @@ class ClosedLoop:
         self._choose, self._react, self._observe = choose, react, observe
         self._discount, self._like = discount, like
         self._components, self._follow = components, follow
-        self._drives: list[Drive] = []
+        self._drives: list[LinkMotion] = []
         self._joints_bar: Any = None
         engine = self._engine
         self._row = engine.batch * engine.actions_per_step
@@ -395,7 +395,7 @@ class ClosedLoop:
         # Which particle was where when each observation was made.
         self._numbers: list[ti.Ndarray] = []
 
-    def look(self, t: int, state: ti.Ndarray, slot: int) -> None:
+    def observe_step(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Observe the state before step t, in a time slot of an array, and have its actions chosen."""
         engine = self._engine
         self._numbers.append(self._particles.order.noted())
@@ -415,13 +415,13 @@ class ClosedLoop:
 
     def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Look at the state that step t has led to."""
-        self.look(t + 1, state, slot)
+        self.observe_step(t + 1, state, slot)
 
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
         """Add to the adjoint of the state that step t has led to what it does through its observation."""
         if self._discount != 1.0:
             self._engine.write(self._engine.term_weights, self.weights * self._discount**t)
-        given = self.answer(t + 1)
+        given = self.react_at(t + 1)
         if given is None:
             return
         engine, stride = self._engine, self._stride
@@ -439,7 +439,7 @@ class ClosedLoop:
         if engine.manipulators:
             engine.add_pose_cotangents(_flat(posed))
 
-    def answer(self, t: int) -> tuple[Any, Any] | None:
+    def react_at(self, t: int) -> tuple[Any, Any] | None:
         """Ask for the reaction to the adjoint of the actions of step t, or to the last observation."""
         if t == self._steps:
             return self._react(t, None)

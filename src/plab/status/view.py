@@ -16,7 +16,7 @@ from rich.text import Text
 from plab.errors import ArgumentError, tell
 from plab.status.survey import STATES, Survey
 
-EVERY = 1.0
+INTERVAL = 1.0
 """Interval between two looks [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
@@ -106,7 +106,7 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
             live.update(_screen(found, console.height - _AROUND), refresh=True)
             if found.runs and all(run.state in ("done", "failed") for run in found.runs):
                 return
-            pause(EVERY)
+            pause(INTERVAL)
 
 
 def _screen(found: Survey, room: int) -> Group:

@@ -24,8 +24,8 @@ from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.submission import (
     UNSEEN,
     Card,
+    Checksums,
     Configuration,
-    Digests,
     SubmissionError,
     read,
 )
@@ -133,7 +133,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
-            for table, line in _handed_in(path, tuple(overrides)):
+            for table, line in _submission_lines(path, tuple(overrides)):
                 tables[table].append(line)
         except ResultsError as error:
             left_out.append(str(error))
@@ -186,11 +186,11 @@ def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point
 
 
 @functools.cache
-def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Digests:
-    return Digests.of(configuration.config(overrides))
+def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Checksums:
+    return Checksums.of(configuration.config(overrides))
 
 
-def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
+def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
     """Yield the lines of a submission, with their tables.
 
     Raises:

@@ -13,8 +13,8 @@ from plab.results import Row
 from plab.results.table import readable_rows
 from plab.submissions.submission import (
     SUFFIX,
+    Checksums,
     Configuration,
-    Digests,
     Entry,
     SubmissionError,
     configuration_of,
@@ -70,7 +70,7 @@ def _of_run(row: Row) -> Entry:
     except RenderError as error:
         raise SubmissionError(str(error)) from None
     return Entry(
-        configuration_of(cfg), Digests.of(cfg), steps_to_best(row), row.values["score_best"], actions
+        configuration_of(cfg), Checksums.of(cfg), steps_to_best(row), row.values["score_best"], actions
     )
 
 
@@ -111,5 +111,5 @@ def from_policies(
             configuration = configuration_of(cfg)
             if one.failure:
                 raise SubmissionError(f"{configuration.name}: the simulation broke off, {one.failure}")
-            entries.append(Entry(configuration, Digests.of(cfg), steps, one.score, policy=name))
+            entries.append(Entry(configuration, Checksums.of(cfg), steps, one.score, policy=name))
     return entries, files

@@ -20,7 +20,7 @@ from plab.report.series import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.submission import (
     SUFFIX,
-    Digests,
+    Checksums,
     Entry,
     Submission,
     SubmissionError,
@@ -29,13 +29,13 @@ from plab.submissions.submission import (
     write,
 )
 
-_ledgers: dict[Path, _Ledger] = {}
+_ledgers: dict[Path, _BestEpisodes] = {}
 """Ledgers of this process by file: environments of one configuration share one, and their steps add up."""
 
 Env = TypeVar("Env")
 
 
-class _Ledger:
+class _BestEpisodes:
     """Best episodes of one configuration, one within each budget, in a file.
 
     Attributes:
@@ -50,7 +50,7 @@ class _Ledger:
             ResultsError: If it cannot be written.
         """
         self.steps = 0
-        self._configuration, self._digests = configuration_of(cfg), Digests.of(cfg)
+        self._configuration, self._digests = configuration_of(cfg), Checksums.of(cfg)
         self._best: dict[float, Entry] = {}
         self._path = path
         try:
@@ -108,7 +108,7 @@ def record(env: Env, folder: str | Path) -> Env:
     for cfg in batch.configs:
         path = Path(folder).resolve() / f"{configuration_of(cfg).name}{SUFFIX}"
         if path not in _ledgers or not path.exists():
-            _ledgers[path] = _Ledger(cfg, path)
+            _ledgers[path] = _BestEpisodes(cfg, path)
         ledgers.append(_ledgers[path])
     taken: deque[np.ndarray] = deque(maxlen=batch.horizon)
 

@@ -149,7 +149,7 @@ def configuration_of(cfg: Config) -> Configuration:
 
 
 @dataclass(frozen=True)
-class Digests:
+class Checksums:
     """SHA-256, in hex, of scene and target, which decide a score beside the actions.
 
     Attributes:
@@ -161,7 +161,7 @@ class Digests:
     target: str
 
     @classmethod
-    def of(cls, cfg: Config) -> Digests:
+    def of(cls, cfg: Config) -> Checksums:
         """Compute those of a configuration.
 
         Raises:
@@ -175,7 +175,7 @@ class Digests:
         facts = json.dumps(scene.facts(), sort_keys=True, default=attrgetter("sha256")).encode()
         return cls(hashlib.sha256(facts).hexdigest(), hashlib.sha256(target).hexdigest())
 
-    def difference(self, other: Digests) -> str | None:
+    def difference(self, other: Checksums) -> str | None:
         """Return ``scene`` or ``target``, whichever differs first; None if both agree."""
         return next((part for part, own in vars(self).items() if own != getattr(other, part)), None)
 
@@ -194,7 +194,7 @@ class Entry:
     """
 
     configuration: Configuration
-    digests: Digests
+    digests: Checksums
     steps: int
     score: float
     actions: np.ndarray | None = None
@@ -419,7 +419,7 @@ def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
     file, claim = record["file"], (record["steps"], float(record["score"]))
     if file not in members:
         raise UnreadableError(f"{where} names a file that is not there: {file}")
-    digests = Digests(record["scene"], record["target"])
+    digests = Checksums(record["scene"], record["target"])
     if not file.startswith("actions/"):
         return Entry(configuration, digests, *claim, policy=file)
     try:

@@ -26,8 +26,8 @@ from plab.results.running import now
 from plab.scenes import PRECISIONS
 from plab.submissions.submission import (
     SUFFIX,
+    Checksums,
     Configuration,
-    Digests,
     Entry,
     Submission,
     SubmissionError,
@@ -47,7 +47,7 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """Function of observations, float32, shape [batch, entry], that returns actions, shape [batch, action]."""
 
 
-class Played(NamedTuple):
+class ReplayedScore(NamedTuple):
     """Score of an episode's last state, NaN if it broke off, and the failure."""
 
     score: float
@@ -109,7 +109,7 @@ def verify(
     """
     given = tuple(overrides)
     cfgs = _configs(submission, given)
-    scores: dict[int, dict[str, Played]] = defaultdict(dict)
+    scores: dict[int, dict[str, ReplayedScore]] = defaultdict(dict)
     # Each group is what one simulator can play.
     alike: dict[Any, list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
@@ -139,7 +139,7 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
         )
     names = {entry.configuration for entry in submission.entries}
     found = {configuration: configuration.config(overrides) for configuration in sorted(names)}
-    digests = {configuration: Digests.of(cfg) for configuration, cfg in found.items()}
+    digests = {configuration: Checksums.of(cfg) for configuration, cfg in found.items()}
     for entry in submission.entries:
         if part := entry.digests.difference(digests[entry.configuration]):
             raise SubmissionError(
@@ -150,7 +150,7 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
     return found
 
 
-def _verdict(entry: Entry, played: Mapping[str, Played]) -> Verdict:
+def _verdict(entry: Entry, played: Mapping[str, ReplayedScore]) -> Verdict:
     if not played:
         return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
     scores = {precision: one.score for precision, one in played.items()}
@@ -168,7 +168,7 @@ def _verdict(entry: Entry, played: Mapping[str, Played]) -> Verdict:
 
 def play(
     cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], precision: str, name: str = ""
-) -> list[Played]:
+) -> list[ReplayedScore]:
     """Play plans or a policy in several configurations of one task, in the hard contact model.
 
     Args:
@@ -181,7 +181,7 @@ def play(
         SubmissionError: If a plan has not as many steps or components as its task, or the policy cannot be
             run, gives actions that do not fit, or answers the same observation twice differently.
     """
-    played: list[Played] = []
+    played: list[ReplayedScore] = []
     for start in range(0, len(cfgs), _BATCH):
         some = cfgs[start : start + _BATCH]
         batch = EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
@@ -198,7 +198,7 @@ def play(
         batch.close()
         for n, score in enumerate(step.info["score"]):
             failure = step.failures.get(n, "")
-            played.append(Played(math.nan if failure else float(score), failure))
+            played.append(ReplayedScore(math.nan if failure else float(score), failure))
     return played
 
 

@@ -57,7 +57,7 @@ def gpu_workers(
         for name, k in places[:most]
     ]
     try:
-        yield partial(_carry, workers), len(places)
+        yield partial(_dispatch, workers), len(places)
     finally:
         for worker in workers:
             worker.dismiss()
@@ -65,7 +65,7 @@ def gpu_workers(
             worker.end()
 
 
-def _carry(
+def _dispatch(
     workers: Sequence[_Worker], batches: list[list[Config]], progress: Callable[[], str]
 ) -> Iterator[Outcome]:
     """Give batches to free processes, print which runs have finished, and yield the outcomes."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from plab.config import Config, build_scene
 from plab.config.families import family
-from plab.config.selection import OBSERVED
+from plab.config.selection import OBSERVATION_KEYS
 from plab.problem import build_scenes
 from plab.results import row_count
 from plab.scenes import Scene
@@ -52,7 +52,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    seen = [getattr(cfg, key) for key in OBSERVED]
+    seen = [getattr(cfg, key) for key in OBSERVATION_KEYS]
     kind = [cfg.task.name, cfg.method.family, seen, *shared, loss]
     own = family(cfg.method.family)
     if not own.batching:

@@ -24,7 +24,7 @@ from plab.config import Config, ConfigError
 from plab.config.compose import check_sources, choices, compose, finish, hydra_app, require_runnable
 from plab.config.words import parse, swept
 from plab.errors import tell
-from plab.plugins import passed_on
+from plab.plugins import exported_module_path
 from plab.results import ResultsError, RunFile, read
 from plab.results.running import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
@@ -226,7 +226,7 @@ def _carry_elsewhere(
             task_function=partial(_job, batches),
             config=config,
         )
-        with passed_on():
+        with exported_module_path():
             # A job composes the configuration of its first run and then computes the whole batch.
             returns = launcher.launch([jobs[str(batch[0].path)] for batch in batches], 0)
         yield from [one for job in returns for one in job.return_value]

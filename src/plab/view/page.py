@@ -81,7 +81,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         menu_visibility=False,
     )
     bodies = (_surfaces if surface else _particles)(recording, steps)
-    things = [*bodies, *_manipulators(recording, steps), *_ghost(recording), _floor()]
+    things = [*bodies, *_manipulators(recording, steps), *_target_mesh(recording), _floor()]
     for number, thing in enumerate(things, start=1):
         # Not where it lies in memory: the same rollout gives the same page.
         thing.id = number
@@ -146,7 +146,7 @@ def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[
             yield mesh
 
 
-def _ghost(recording: RecordedRollout) -> Iterator[Any]:
+def _target_mesh(recording: RecordedRollout) -> Iterator[Any]:
     """Yield the target, if there is one."""
     if recording.target_mass is not None:
         mesh = _mesh(target_mesh(recording.scene, recording.target_mass), TARGET_COLOR, "target")

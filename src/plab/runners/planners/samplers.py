@@ -106,7 +106,7 @@ class Sampler(Planner):
         order = cost.argsort(stable=True)
         self.memory |= {"candidates": actions[order], "best": points[order[0]].clone()}
         if first:
-            self.settle(points[order[0]])
+            self.recentre(points[order[0]])
         else:
             self.learn(points, cost)
         if softness is not None:
@@ -116,7 +116,7 @@ class Sampler(Planner):
         return self.show(actions, answer)
 
     @abstractmethod
-    def settle(self, point: Tensor) -> None:
+    def recentre(self, point: Tensor) -> None:
         """Begin to draw around a curve, shape [K, A]."""
 
     @abstractmethod
@@ -160,7 +160,7 @@ class Cem(Sampler):
 
     method: CemConfig
 
-    def settle(self, point: Tensor) -> None:
+    def recentre(self, point: Tensor) -> None:
         self.memory |= {"mean": point.clone(), "std": torch.full_like(point, self.method.spread)}
 
     def sample(self, random: torch.Generator) -> Tensor:
@@ -192,7 +192,7 @@ class Mppi(Sampler):
 
     method: MppiConfig
 
-    def settle(self, point: Tensor) -> None:
+    def recentre(self, point: Tensor) -> None:
         self.memory["mean"] = point.clone()
 
     def sample(self, random: torch.Generator) -> Tensor:
@@ -218,7 +218,7 @@ class Cmaes(Sampler):
     method: CmaesConfig
     _search: CMA
 
-    def settle(self, point: Tensor) -> None:
+    def recentre(self, point: Tensor) -> None:
         from cmaes import CMA
 
         flat = point.flatten().cpu().numpy()
@@ -251,6 +251,6 @@ class Cmaes(Sampler):
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self.settle(self.memory["best"])
+        self.recentre(self.memory["best"])
         held = {name: np.asarray(value)[()] for name, value in state["search"].items()}
         self._search.__setstate__(self._search.__getstate__() | held)

@@ -29,13 +29,13 @@ ALIGNMENTS = 10
 TUBE = 0.04
 """Half width of what a manipulator is taken to meet on its way [domain units]."""
 
-PRESS = (0.0, 0.03)
+PRESS_DEPTH = (0.0, 0.03)
 """Range of how far manipulators press into a body before they carry it [domain units]."""
 
 ARCH = (0.0, 0.15)
 """Range of how far half of the ways of what is carried go up first, and down again [domain units]."""
 
-LEFT_ALONE = 100.0
+UNREACHED_COST = 100.0
 """Points of a body that no manipulator is near to cost so many times their squared way."""
 
 OVERSHOOT = (0.5, 1.5)
@@ -116,7 +116,7 @@ class ContactStarts:
         goals = np.stack(np.unravel_index(nodes, self._target.shape), axis=1) * scene.dx
         moved = np.zeros_like(points)
         held = {self._owner(tool) for tool in self._tools} or set(body.tolist())
-        weight = np.where(np.isin(body, list(held)), 1.0, LEFT_ALONE)[:, None]
+        weight = np.where(np.isin(body, list(held)), 1.0, UNREACHED_COST)[:, None]
         for _ in range(ALIGNMENTS if len(scene.bodies) > 1 else 1):
             _, assigned = linear_sum_assignment(weight * cdist(points + moved, goals, "sqeuclidean"))
             ways = goals[assigned] - points
@@ -141,7 +141,7 @@ class ContactStarts:
     def _carry(self, rng: np.random.Generator) -> np.ndarray:
         points, ways, body = self._transport
         middle = _middle_ways(ways, body)
-        press, tracks = rng.uniform(*PRESS), []
+        press, tracks = rng.uniform(*PRESS_DEPTH), []
         for tool in self._tools:
             own = points[body == self._owner(tool)]
             track = ActionTrack(tool)

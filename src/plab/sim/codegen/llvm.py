@@ -189,7 +189,7 @@ class Code:
     def moved(self, pointer: ir.Value, entries: ir.Value) -> ir.Value:
         return self._b.gep(pointer, [entries])
 
-    def times_word(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def mul_word(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.mul(a, b)
 
     def lane(self, pointer: ir.Value, entry: int) -> ir.Value:
@@ -323,7 +323,7 @@ class Number:
         return Number(self.code, getattr(self.code, name)(*values))
 
     def __add__(self, other: Number | float) -> Number:
-        return self if _is(other, 0.0) else self._operation("add", self, other)
+        return self if _equals(other, 0.0) else self._operation("add", self, other)
 
     __radd__ = __add__
 
@@ -335,7 +335,13 @@ class Number:
 
     def __mul__(self, other: Number | float) -> Any:
         # Zeros that only say of which kind a number is.
-        return other if _is(other, 0.0) else self if _is(other, 1.0) else self._operation("mul", self, other)
+        return (
+            other
+            if _equals(other, 0.0)
+            else self
+            if _equals(other, 1.0)
+            else self._operation("mul", self, other)
+        )
 
     __rmul__ = __mul__
 
@@ -376,5 +382,5 @@ _UFUNCS = {
 """Operators that NumPy's numbers call as functions."""
 
 
-def _is(other: Number | float, number: float) -> bool:
+def _equals(other: Number | float, number: float) -> bool:
     return not isinstance(other, Number) and other == number

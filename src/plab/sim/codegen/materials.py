@@ -154,7 +154,7 @@ def series_of(real: ir.Type) -> algebra.Series:
     return algebra.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
 
 
-def served(one: Tile | Particle, j: Number, z_squared: Number) -> list[ir.Value]:
+def in_series_range(one: Tile | Particle, j: Number, z_squared: Number) -> list[ir.Value]:
     """Return where the series serve J and |Z|^2."""
     code = one.code
     above = code.below(z_squared.value, one.number("z_squared_max").value, equal=True)
@@ -209,7 +209,7 @@ class Tile:
         g = algebra.trial_gradient(c, f, self.number("dt"))
         j = algebra.det(g)
         found = von_mises.hencky_strain(g, j, self.series)
-        self.code.put("served", self.all_own(*served(self, j, found[3])))
+        self.code.put("served", self.all_own(*in_series_range(self, j, found[3])))
         return c, g, j, found
 
     def parameters(self) -> list[Number]:
@@ -413,11 +413,11 @@ class Particle:
         g = algebra.trial_gradient(c, f, self.number("dt"))
         j = algebra.det(g)
         found = von_mises.hencky_strain(g, j, self.series)
-        fits = self.code.all_of(*served(self, j, found[3]))
+        fits = self.code.all_of(*in_series_range(self, j, found[3]))
         self.code.put("served", self.code.flag(fits))
         return g, j, found, fits
 
-    def flows(self, d: Sequence[Number], limit: Number) -> ir.Value:
+    def is_yielding(self, d: Sequence[Number], limit: Number) -> ir.Value:
         """Return whether the factor of return mapping is below 1."""
         factor = von_mises.yield_factor(d, limit)[3]
         return self.code.below(factor.value, self.code.constant(1.0))
@@ -436,7 +436,7 @@ def scheduled_particle(module: ir.Module, name: str, real: ir.Type) -> None:
         tau = von_mises.stress(d, j, c2, mu, lam, limit, one.series)
         one.leave("c", scattered_matrix(tau, c, one.number("stress_scale"), one.number("mass")))
         one.leave("f", g)
-        with code.where(one.flows(d, limit)):
+        with code.where(one.is_yielding(d, limit)):
             one.leave("f", von_mises.flow(d, g, limit, one.series))
     code.end()
 
@@ -452,7 +452,7 @@ def scheduled_particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> N
         scale = one.number("stress_scale")
         d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
         kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
-        with code.where(one.flows(d, limit)):
+        with code.where(one.is_yielding(d, limit)):
             d_flow, g_flow, limit_flow = flow_adjoint(d, g, limit, g_bar, one.series)
             sums = [x + y for x, y in zip((*d_bar, bars[2]), (*d_flow, limit_flow), strict=True)]
             code.set_variables(kept, [x.value for x in (*sums, *g_flow)])

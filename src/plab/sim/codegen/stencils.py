@@ -20,8 +20,8 @@ from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, MOMENTUM_FIELD, OFFSETS,
 
 def rows_of(code: Code, grid: ir.Value) -> list[list[ir.Value]]:
     """Return where the rows of a stencil begin, by offset along x and y; ``grid`` is its base node."""
-    along_y = code.times_word(code.args["axis"], WORD(4))
-    along_x = code.times_word(along_y, code.args["axis"])
+    along_y = code.mul_word(code.args["axis"], WORD(4))
+    along_x = code.mul_word(along_y, code.args["axis"])
     out: list[list[ir.Value]] = []
     for i in range(3):
         first = code.moved(out[i - 1][0], along_x) if i else grid
