@@ -1,9 +1,9 @@
 """Depth, segmentation and colour pictures of all environments of a simulator, on its device.
 
-Two passes per camera: one ray per pixel finds the floor in closed form and manipulators by sphere tracing
-their signed distances; then each particle writes the ball of its share of the volume to the pixels that it
-covers. A pixel is one integer, depth in the upper bits and label in the lower ones, so that an atomic
-minimum keeps what is nearest, whatever the order. Pictures are the same on every run and in every batch.
+Two passes per camera: one ray per pixel intersects the floor in closed form and manipulators by sphere
+tracing; then each particle is drawn as a ball of the particle's volume. A pixel is one integer with depth in
+the upper bits and label in the lower ones, so that an atomic minimum selects the nearest surface in any
+order. Pictures are reproducible, independent of the batch.
 """
 
 import sys
@@ -26,10 +26,10 @@ BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
 """Labels of segmentation; manipulators and bodies are numbered from the last two on."""
 
 BALL_RADIUS = 0.7
-"""Radius of a particle's ball [mean particle spacings], for which the depth of plasticine has no bias."""
+"""Radius of a particle's ball [mean particle spacings], chosen such that depth is unbiased."""
 
 TRACING_STEPS = 96
-"""Steps of sphere tracing along a ray, at most."""
+"""Maximum number of sphere-tracing steps per ray."""
 
 PALETTE = [
     [246, 244, 240],
@@ -40,7 +40,7 @@ PALETTE = [
     [0, 158, 115],
     [204, 121, 167],
 ]
-"""Colours of background, floor, manipulators and bodies, which take the last ones in turn [0 to 255]."""
+"""Colours of background, floor, manipulators and bodies [0 to 255]; bodies cycle through the last ones."""
 
 
 @ti.data_oriented
@@ -51,7 +51,7 @@ class CameraSensor:
         """Allocate the pictures.
 
         Args:
-            simulator: Its current states are what is seen.
+            simulator: The simulator; pictures show its current states.
             camera: The camera, the same for all environments.
         """
         self.camera = camera
@@ -196,7 +196,7 @@ class CameraSensor:
         focal: ti.f32,
         near: ti.f32,
     ):
-        """Write the particles' balls over what is behind them."""
+        """Draw the balls of the particles."""
         for q in range(self.engine.batch * self.engine.tiles * self.engine.lanes):
             e, place = self.engine.particle_of(q)
             if place < self.engine.particles:
@@ -239,7 +239,7 @@ class CameraSensor:
 
     @ti.func
     def point(self, keys: ti.template(), frame: ti.template(), e, row, column, focal):
-        """Position that a pixel shows, relative to the camera."""
+        """Position of the surface at a pixel, relative to the camera."""
         depth = self.depth_of(keys[(e * self.height + row) * self.width + column])
         return depth * self.ray(frame, row, column, focal)
 

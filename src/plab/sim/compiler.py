@@ -1,10 +1,9 @@
-"""The kernels' compiler: Taichi, or Quadrants, a fork of it with wheels for Python 3.14.
+"""Compiler of the kernels: Taichi, or Quadrants, its fork with wheels for Python 3.14, and patches of both.
 
-No other module imports either, or uses what their documented interfaces do not promise. Written for Taichi
-1.7.4 (July 2025) and Quadrants 1.3.3; pyproject.toml has the versions that are allowed. Each function says
-what it changes or uses, and why. Nothing of the standard library is changed. :mod:`plab.sim` imports this
-module before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the
-others.
+Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025) and
+Quadrants 1.3.3; pyproject.toml has the versions that are allowed. Each function documents its changes and
+their reason. The standard library is not changed. :mod:`plab.sim` imports this module before any kernel is
+defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
 """
 
 from __future__ import annotations
@@ -47,17 +46,17 @@ else:
 
 
 def _skip_source_search() -> None:
-    """Let Taichi's decorators tell functions from methods without a search for the source: patches
+    """Detect methods in Taichi's decorators without searching for sources: patches
     ``kernel_impl._inside_class``.
 
-    For each function of a module Taichi asks ``inspect`` for the source of the module's importer, which looks
-    through all modules, each time, for a file that it does not know: a quarter of the simulator's import.
+    For each function, Taichi calls ``inspect`` for the source of the importing module, which searches all
+    modules every time and takes a quarter of the simulator's import.
     """
     tell = _traced._inside_class
 
     @functools.wraps(tell)
     def inside_class(level_of_class_stackframe: int) -> bool:
-        # The frame below the one that Taichi asks for is a class's body, or it is none.
+        # The frame below the one that Taichi inspects is a class body or not.
         if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
             return False
         return bool(tell(level_of_class_stackframe + 1))
@@ -73,10 +72,10 @@ if not QUADRANTS:
 
 
 def defer_position_lookup() -> None:
-    """Look up the place of an AST node only once there is an error to report: patches
+    """Compute the position of an AST node only when an error is reported: patches
     ``ASTTransformerContext.get_pos_info``.
 
-    Taichi wraps an excerpt of the source for each node: half of what compiling from a warm cache takes.
+    Taichi wraps an excerpt of the source for each node, half of the compile time with a warm cache.
     """
     if QUADRANTS:
         return
@@ -93,12 +92,13 @@ def defer_position_lookup() -> None:
 
 @contextlib.contextmanager
 def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Tell which kernel is being compiled while the ``with`` block lasts: patches
-    ``kernel_impl._get_tree_and_ctx``, or ``FuncBase.get_tree_and_ctx`` of Quadrants, which is called for each
-    kernel or function that is compiled, and at no launch.
+    """Report kernels being compiled inside the ``with`` block: patches ``kernel_impl._get_tree_and_ctx``, or
+    ``FuncBase.get_tree_and_ctx`` of Quadrants, which is called for each compiled kernel or function, but not
+    for launches.
 
     Args:
-        tell: Takes the kernel's name when its compiling begins, and an empty name after its first launch.
+        tell: Called with the name of a kernel when its compilation begins, and with an empty name after its
+            first launch.
     """
     original = getattr(_traced, _TRACE)
 
@@ -120,7 +120,7 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
 def _notify_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 
     def launch(*args: Any, **kwargs: Any) -> Any:
-        # Only of this launch: the attribute hides the method.
+        # Only for this launch; the instance attribute hides the method.
         del kernel.launch_kernel
         try:
             return kernel.launch_kernel(*args, **kwargs)
@@ -134,19 +134,20 @@ def _notify_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 
 
 def clear_kernel_arguments() -> None:
-    """Let kernels forget what they were called with before Taichi started anew: clears ``Kernel.mapper``.
+    """Drop the arguments that kernels were called with before Taichi was reinitialised: clears
+    ``Kernel.mapper``.
 
-    Taichi's own kernels would hold all fields that they have ever filled or read, some 100 kB of a simulator.
+    Otherwise Taichi's own kernels keep references to all fields, about 100 kB per simulator.
     """
     for kernel in impl.get_runtime().kernels:
         kernel.mapper.mapping.clear()
 
 
 def guard_array_release() -> None:
-    """Let arrays of before Taichi started anew free nothing when Python forgets them: patches
+    """Prevent arrays created before a reinitialisation of Taichi from freeing memory: patches
     ``ScalarNdarray.__init__`` and ``__del__``.
 
-    Taichi would free what is at their addresses by now, an array that is in use, perhaps.
+    Otherwise Taichi might free a new array at the same address.
     """
     if QUADRANTS:
         return
@@ -162,7 +163,7 @@ def guard_array_release() -> None:
 
     @functools.wraps(free)
     def freed(self: Any) -> None:
-        # There is none when Python has taken Taichi apart, at its own end.
+        # The program is missing during interpreter shutdown.
         runtime = current()
         if runtime is not None and self.start() is runtime:
             free(self)
@@ -171,7 +172,7 @@ def guard_array_release() -> None:
 
 
 def address_of(array: ti.Ndarray) -> int:
-    """Return the address of an array's first number, which bitcode takes."""
+    """Return the address of an array's first number, for bitcode functions."""
     return int(impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr))
 
 
@@ -179,7 +180,7 @@ def address_of(array: ti.Ndarray) -> int:
 
 
 def cache_lock() -> Path:
-    """Return the lock of the cache of compiled kernels, which killed processes leave behind."""
+    """Return the lock file of Taichi's cache of compiled kernels."""
     place, lock = ("QD", "kernel_compilation_manager/qdcache.lock") if QUADRANTS else ("TI", "ticache.lock")
     folder = os.environ.get(f"{place}_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
     return Path(folder, lock)
@@ -193,14 +194,14 @@ def cuda_available() -> bool:
 # -- bitcode ------------------------------------------------------------------------------------------------
 
 local_variable = impl.expr_init
-"""Makes a local variable within a ``ti.func``, where a list of variables is wanted."""
+"""Create a local variable in a ``ti.func`` that needs a list of variables."""
 
 
 def bitcode_function(path: str, symbol: str) -> Callable[..., None]:
-    """Return a function of a file of LLVM bitcode, which Taichi links into its kernels; it takes local
+    """Return a function from a file of LLVM bitcode, which Taichi links into kernels; its arguments are local
     variables.
 
-    Sets ``SourceBuilder.bc`` and ``mode``, as the public way to them compiles C++ with clang.
+    Sets ``SourceBuilder.bc`` and ``mode`` directly, because the public interface compiles C++ with clang.
     """
     source = SourceBuilder()
     source.bc, source.mode = path, "bc"

@@ -1,9 +1,9 @@
 """Engine of the CPU: phases of a substep by chunks of particles and shares of the blocks, and its kernels.
 
-Each chunk has a private grid, so that scattering needs no atomics. One launch does a whole environment step.
-A team of threads works on one environment, meeting at barriers between phases (a launch costs a hundred
-microseconds of waking threads, a barrier less than one); with more environments than threads every thread
-has environments of its own.
+Each chunk has a private grid, so that scattering needs no atomics. A launch executes a whole environment
+step. A team of threads works on one environment and synchronises at barriers between phases (a launch costs a
+hundred microseconds to wake threads, a barrier less than one); with more environments than threads, each
+thread has separate environments.
 """
 
 import time
@@ -106,8 +106,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         stamp,
         adjoint: ti.template(),
     ):
-        """Material update, and scatter of momentum and mass; on the way back (``adjoint``) without update,
-        and with scatter of the adjoint of the grid velocities."""
+        """Material update, and scatter of momentum and mass; in the backward pass (``adjoint``) without
+        update, and with scatter of the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
         at = self.masked_index(grid_index * STENCILS)
         bases_at = self.masked_index(grid_index * BASES)
@@ -263,7 +263,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
-        """Spread mass, sum the particles' terms, and tally their distances from the manipulators."""
+        """Scatter mass, sum the particle terms, and accumulate distances from the manipulators."""
         grid_index = e * self.chunks + c
         for k, _column, term in ti.static(self.distance_terms):
             for m in range(self.manipulators):
@@ -284,7 +284,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def accumulate_distances(self, e, c, particle, x):
-        """Add a particle of a chunk to the tallies of its distances."""
+        """Accumulate the distances of a particle of a chunk."""
         if ti.static(len(self.distance_terms) > 0):
             for shape, start, stop in ti.static(self.shape_ranges):
                 if ti.static(self.moves(shape)):
@@ -324,8 +324,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def distance_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
-        """Add the gradient of terms that look at all particles' distances to their adjoints, and to the
-        chunk's share in the poses'."""
+        """Add the gradient of distance terms over all particles to the particle adjoints and to the chunk's
+        part of the pose adjoints."""
         for m in range(self.manipulators):
             self.pose_part[e, c, m] = ti.Vector.zero(ti.f64, 8)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
@@ -337,7 +337,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                     if ti.static(self.acts(shape)):
                         for m in range(start, stop):
                             x_bar, pose_bar = self.distance_gradient(shape, e, m, tile * self.lanes + lane, x)
-                            # Plainly: += on a field is an atomic.
+                            # Written out, because += on a field is an atomic.
                             self.pose_part[e, c, m] = self.pose_part[e, c, m] + pose_bar
                             for i in ti.static(range(3)):
                                 bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
@@ -351,14 +351,15 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
 
 class TeamChoice:
-    """Chooses between teams of threads for a kernel's launches, by what they take.
+    """Selection of the fastest team of threads for the launches of a kernel.
 
-    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
-    Results do not depend on the choice.
+    Barriers are slow if other programs keep the cores busy, because waiting threads spin. Results do not
+    depend on the choice.
     """
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first team, of so many threads; the others are tried in their order."""
+        """Start with the first of some teams, given by their numbers of threads; the others are tried in
+        order."""
         self._seconds: dict[int, deque[float]] = {size: deque(maxlen=TIMED_LAUNCHES) for size in sizes}
         self._launches, self._probe_at = 0, PROBE_FIRST
 
@@ -376,7 +377,8 @@ class TeamChoice:
         fastest = {size: min(seconds, default=0.0) for size, seconds in self._seconds.items()}
         tried = {size: len(seconds) for size, seconds in self._seconds.items()}
         limit = SLOW_TEAM_RATIO * next(iter(fastest.values()))
-        # As many launches of each at first: the first ones of a process are often interrupted.
+        # Initially time each team equally often, because the first launches of a process are often
+        # interrupted.
         if wanted := [size for size in fastest if tried[size] < TIMED_LAUNCHES and fastest[size] <= limit]:
             return min(wanted, key=tried.__getitem__)
         if self._launches >= self._probe_at:
@@ -421,7 +423,7 @@ class CpuEngine(CpuPhases):
         if size > 1:
             ticket = ti.atomic_add(self.arrivals[team * PADDING], 1)
             goal = (ticket // size + 1) * size
-            # An atomic that changes nothing: a plain load could be hoisted out of the loop.
+            # An atomic without effect, because a plain load could be hoisted out of the loop.
             while ti.atomic_or(self.arrivals[team * PADDING], 0) < goal:
                 pass
 
@@ -560,12 +562,12 @@ class CpuEngine(CpuPhases):
         stamp: ti.i32,
         contact: ti.i32,
     ):
-        """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of
-        its loss, with the measures that it is made of written to ``terms`` from entry ``at``.
+        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps``, and of its
+        loss, whose measures are written to ``terms`` from entry ``at``.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it,
-        ``pose_bar`` likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does
-        not matter and is left alone.
+        ``pose_bar`` likewise. If there was no ``contact`` up to the end of this step, ``bar`` is not needed
+        and unchanged.
         """
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):

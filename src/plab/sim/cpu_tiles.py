@@ -1,10 +1,10 @@
 """Transfers and material of a tile of particles on the CPU, by lanes of SIMD registers, and their adjoints.
 
-LLVM vectorises what ends in stores to a field, and what begins with loads from one. A transfer therefore
-leaves what a tile's particles need of their stencils in ``stencils`` (lane vectors, one particle per lane),
-and sums over the nodes of one particle after the other take it from there. These sums and the laws are LLVM's
-bitcode (:mod:`plab.sim.codegen`), of which Taichi would make slow code. Each part of von Mises plasticity
-takes its input from ``strains`` and leaves its results there.
+LLVM vectorises loops that begin with loads from a field or end with stores to one. A transfer therefore first
+writes the stencil data of a tile to ``stencils`` (lane vectors, one particle per lane), and then sums over
+the nodes of each particle. These sums and the laws are LLVM bitcode (:mod:`plab.sim.codegen`), because
+Taichi's code for them is slow. Each part of von Mises plasticity takes its input from ``strains`` and leaves
+its results there.
 
 ``at`` and ``bases_at`` are the first entries of a thread's shares of ``stencils`` and ``bases``; ``source``,
 ``target`` and ``entry9`` those of a tile in states and in ``affine``; ``state_at`` and ``bar_at`` are the
@@ -110,10 +110,10 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def masked_index(self, index):
-        """An index, the same: one of which LLVM can tell that sums with it do not overflow.
+        """Mask the upper bits of an index, so that LLVM can prove that sums with it do not overflow.
 
-        So it computes one address for all that lies at fixed distances, and finds neighbours to be
-        neighbours. Without, each of a stencil's nodes takes four instructions for its address.
+        LLVM then computes one address for all nodes at constant offsets. Otherwise each node of a stencil
+        takes four instructions for its address.
         """
         return index & INDEX_MASK
 
@@ -121,8 +121,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def stencil_tile(self, state: ti.template(), source, at, bases_at, slopes: ti.template()):
-        """Weights, offsets and base nodes of a tile's particles, and the weights' slopes if asked for, into
-        the thread's shares of ``stencils`` and ``bases``."""
+        """Write weights, offsets and base nodes of a tile's particles, and on request the slopes of the
+        weights, to the thread's part of ``stencils`` and ``bases``."""
         node = ti.Vector.zero(ti.i32, self.lanes)
         block = ti.Vector.zero(ti.i32, self.lanes)
         crossing = ti.Vector.zero(ti.i32, self.lanes)
@@ -155,7 +155,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def adjoint_tile(self, state: ti.template(), source, after, bar: ti.template(), target, at):
-        """Value at the base node of what each particle of a tile adds to the velocities' adjoint."""
+        """Value at the base node of each particle's contribution to the adjoint of the velocities."""
         f = [self.stencils[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
             row = [bar[target + AT_C + 3 * i + j] for j in range(3)]
@@ -182,7 +182,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def scatter_adjoint(self, bar_at, target, lane, grid_node, at):
-        """Add what a particle contributes to the adjoint of the grid's velocities, from that of the state
+        """Add a particle's contribution to the adjoint of the grid velocities, from the adjoint of the state
         after the substep."""
         grid, stencil = ti.get_addr(self.velocity_bar, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + ADJOINT_FIELD, lane)
@@ -239,8 +239,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def mark(self, grid_index, key, stamp):
-        """Note that a chunk's particle touches the blocks around its base node; ``key`` is eight times that
-        node's block, plus which axes the stencil crosses into the next (3 bits)."""
+        """Mark the blocks that the stencil of a chunk's particle touches; ``key`` is eight times the block of
+        the base node, plus a bit for each axis along which the stencil reaches the next block."""
         block = key >> 3
         entry = grid_index * self.blocks + block
         if self.mark_stamp[entry] != stamp:
@@ -253,8 +253,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def collect_blocks(self, e, stamp):
-        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing
-        else."""
+        """Merge the marks of the chunks into the environment's list of blocks, in a deterministic order."""
         count = 0
         for c in range(self.chunks):
             grid_index = e * self.chunks + c
@@ -343,8 +342,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def strain_tile(self, state_at, source, e, entry9, at, number: ti.template(), kind: ti.template()):
-        """Strain of a tile, and its parameters, into ``strains``, in a ``whole_strain`` with what the adjoint
-        needs; whether the series serve all its lanes."""
+        """Write strain and parameters of a tile to ``strains``, with ``whole_strain`` also the intermediate
+        results for the adjoint; return whether all lanes are in the range of the series."""
         self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
         addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
         limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
@@ -363,7 +362,7 @@ class TilePhases(ParticlePhases):
         number: ti.template(),
         update: ti.template(),
     ):
-        """:meth:`law_tile` by parts, of which the new F comes last."""
+        """As :meth:`law_tile`, in parts; the new F is computed last."""
         if self.strain_tile(state_at, source, e, entry9, at, number, "strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine = self.lane_in(self.affine, entry9, 0)

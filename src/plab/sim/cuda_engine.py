@@ -2,8 +2,7 @@
 
 A substep is one launch from Python of a kernel with several parallel loops, because a launch costs 13 to 17
 microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device:
-how many blocks are active is known on the device only, so loops over nodes have a fixed number of threads,
-which share the nodes evenly.
+the number of active blocks is only known on the device, so loops over nodes have a fixed number of threads.
 
 Sums over particles at a node are atomic, in whatever order the device runs them: results differ between
 runs by rounding, unless the simulator is deterministic (:mod:`plab.sim.cuda_sums`).
@@ -23,13 +22,13 @@ THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 
 RESIDENT_BLOCKS = 2
-"""Blocks of a multiprocessor in the step that is one launch, at most."""
+"""Maximum number of blocks per multiprocessor in the single-launch step."""
 
 RESIDENT_TURNS = 4
-"""Up to so many particles per resident thread a step is one launch, and so is its adjoint."""
+"""Largest number of particles per resident thread for which a step and its adjoint are single launches."""
 
 MAX_TILE_WARPS = 4
-"""Warps that share a tile's particles there, at most."""
+"""Maximum number of warps per tile in the single-launch step."""
 
 RESERVED = 1024
 """Bytes of shared memory that a device takes for itself from each block."""
@@ -39,7 +38,8 @@ MULTIPROCESSORS, SHARED_BYTES = 16, 81
 
 
 def device_attribute(number: int) -> int:
-    """A number of the CUDA device, by asking the driver; Taichi does not tell. 1 if it does not answer."""
+    """Return an attribute of the CUDA device from the driver, since Taichi does not provide it; 1 on
+    failure."""
     value = ctypes.c_int(0)
     driver = cuda_driver()
     if driver is not None:
@@ -58,9 +58,9 @@ class CudaEngine(CudaPhases):
     """Kernels for CUDA; public methods as those of :class:`plab.sim.cpu_engine.CpuEngine`.
 
     ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
-    its length. It is empty before each environment step and each loss, and grows in them: a block that the
-    body leaves within a step costs little, while taking all blocks into the list in every substep would cost
-    an atomic per particle. ``mass_blocks`` is how many the last loss had.
+    its length. It is cleared before each environment step and each loss, and only grows in between: visiting
+    an abandoned block costs little, while rebuilding the list in every substep would cost an atomic per
+    particle. ``mass_blocks`` is its length in the last loss.
     """
 
     def __init__(self, *args: object) -> None:
@@ -73,7 +73,7 @@ class CudaEngine(CudaPhases):
         blocks = device_attribute(MULTIPROCESSORS) * resident_blocks(SIZES[self.real])
         self.resident_threads = blocks * RESIDENT_BLOCK
         self.last_arrival = ctypes.c_int32((1 << 31) - (blocks - 1)).value
-        # Few particles are shared out to more warps, each of which is sooner done with fewer.
+        # Few particles are distributed over more warps, so that each finishes earlier.
         self.parts = max(1, min(MAX_TILE_WARPS, self.resident_threads // self.particle_threads))
         self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
@@ -81,7 +81,7 @@ class CudaEngine(CudaPhases):
 
     @property
     def reduction_threads(self) -> int:
-        """Threads that tally distances."""
+        """Number of threads that reduce distances."""
         return DISTANCE_GROUPS * self.batch * self.manipulators if self.distance_terms else 0
 
     @property
@@ -94,9 +94,9 @@ class CudaEngine(CudaPhases):
 
     @property
     def sorts(self) -> bool:
-        """True if particles are sorted by cell before each step: where there are so many
-        that atomics, not launches, take the time. Not where bodies have materials of their own, which are
-        looked up by place, nor where results must not depend on timing, as the order within a cell does."""
+        """True if particles are sorted by cell before each step. This pays off with many particles, when
+        atomics take more time than launches. Not supported with several materials, which are stored by place,
+        and in deterministic simulators, because the order within a cell depends on timing."""
         return not self.resident and not self.mixed and not self.deterministic
 
     # -- public methods -----------------------------------------------------------------------------
@@ -171,8 +171,8 @@ class CudaEngine(CudaPhases):
         pose_after: ti.i32,
         stamp: ti.i32,
     ):
-        """One environment step in one launch, for few particles: threads that are all resident at once meet
-        at barriers between the phases, where launches would take longer than the phases do."""
+        """One environment step in a single launch, for few particles: resident threads synchronise at
+        barriers between the phases, because launches would take longer than the phases."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
             self.set_frames(w, self.resident_threads, poses, actions, t, pose_before, pose_after)
@@ -188,7 +188,7 @@ class CudaEngine(CudaPhases):
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, time, self.parts)
-                # A warp scatters what it has gathered itself, so that the others need not wait.
+                # Each warp scatters the particles that it has gathered, so no barrier is needed.
                 self.wait_for_warp()
             if w == 0:
                 self.block_count[0] = 0

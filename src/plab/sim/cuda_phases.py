@@ -1,10 +1,9 @@
-"""Phases as CUDA runs them, where its many threads and their registers ask for something else than the CPU:
-of one particle or node, then of one thread, the same whether a launch is a substep or a whole step.
+"""Phases for CUDA, organised for many threads and registers: first those of one particle or node, then those
+of one thread, shared by launches of a substep and of a whole step.
 
-Transfers keep their sums in registers, where the CPU's keep them in memory for LLVM to vectorise; poses are
-advanced by one thread per manipulator; frame adjoints are kept per substep, so that the poses' adjoints
-take one launch per environment step; distances are tallied without atomics, so that sums and ties never
-depend on timing.
+Transfers accumulate in registers. Poses are advanced by one thread per manipulator. Frame adjoints are stored
+per substep, so that the pose adjoints take one launch per environment step. Distances are reduced without
+atomics, so that sums and ties do not depend on timing.
 """
 
 from collections.abc import Sequence
@@ -29,29 +28,30 @@ from plab.sim.shapes import signed_distance
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
 
 DISTANCE_GROUPS = 256
-"""Threads per environment and manipulator that tally distances, warps of them together."""
+"""Threads per environment and manipulator that reduce distances; a multiple of the warp size."""
 
 MOMENTUM_AND_MASS, MASS, VELOCITY = (0, 1, 2, 3), (3,), (0, 1, 2)
 """Components of grids that are scattered to."""
 
 RESIDENT_BLOCK = WARP_BLOCK
-"""Threads of a block of the step that is one launch: Taichi gives them no more registers than two blocks of a
-multiprocessor have."""
+"""Threads per block of the single-launch step; Taichi limits registers to those of two blocks per
+multiprocessor."""
 
 MAX_TESTED_MANIPULATORS = 6
-"""Manipulators of which each node tests all; of more, a block's warps ask first which can reach the block."""
+"""Largest number of manipulators for which each node tests all. With more, warps first select those within
+reach of the block."""
 
 POSE_SHARE = 8
-"""Manipulators that a block moves."""
+"""Manipulators advanced per block."""
 
 
 class CudaPhases(OrderPhases, PosePhases):
-    """Phases that differ from the CPU's.
+    """Phases with a separate implementation for CUDA.
 
     Attributes:
-        resident_threads: Threads that are resident at once, in the kernels that are one launch per step.
-        last_arrival: What the first block adds where all meet, where each other adds 1.
-        pose_threads: Manipulators of all environments, and one at least.
+        resident_threads: Number of resident threads in single-launch kernels.
+        last_arrival: Increment of the first block at the barrier; all others add 1.
+        pose_threads: Number of manipulators of all environments, at least 1.
     """
 
     code_device = "cuda"
@@ -68,7 +68,7 @@ class CudaPhases(OrderPhases, PosePhases):
         return int(min(1 << (self.batch * self.nodes).bit_length(), 1 << 31) - 1)
 
     def attach(self, terms: Sequence[Any]) -> None:
-        """Take over the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
+        """Attach the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
         super().attach(terms)
         threads = self.batch * self.tiles * self.lanes
         moving = self.distance_terms and any(self.moves(shape) for shape in self.shapes)
@@ -78,7 +78,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     def _allocate_adjoint(self) -> None:
         super()._allocate_adjoint()
-        # What the frames' adjoints add to those of the poses at each substep's end and start.
+        # Contributions of the frame adjoints to the pose adjoints at the end and start of each substep.
         shares = (self.batch, self.substeps, max(1, self.manipulators))
         self.end_share = ti.Vector.field(8, ti.f64, shape=shares)
         self.start_share = ti.Vector.field(8, ti.f64, shape=shares)
@@ -113,12 +113,13 @@ class CudaPhases(OrderPhases, PosePhases):
         mx = m0
         my = m0
         mz = m0
-        # A plane at a time: all 27 nodes at once take so many registers that fewer threads are resident.
+        # One plane at a time: all 27 nodes at once need more registers and reduce occupancy.
         for i in range(3):
             wi = ti.select(i == 0, w[0][0], ti.select(i == 1, w[1][0], w[2][0]))
             plane = ti.Vector([0.0, 0.0, 0.0, 0.0])
             for j in ti.static(range(3)):
-                # Masked, so that LLVM can tell that sums with it do not wrap: one address for three nodes.
+                # Masked, so that LLVM can prove that sums do not overflow and use one address for three
+                # nodes.
                 row = (node + (i * self.axis + j) * self.axis) & ti.static(self.node_mask)
                 wij = wi * w[j][1]
                 g1 = (wij * w[1][2]) * self.node4(grid, row + 1)
@@ -191,13 +192,13 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
-        """The affine field of momentum and mass that a particle scatters, given A."""
+        """Affine field of momentum and mass that a particle scatters, given A."""
         v = self.vector(state, source + AT_V, lane)
         return affine_field(self.mass * v, self.mass, a, fx, self.dx)
 
     @ti.func
     def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
-        """The affine field that the particle's adjoint contributes to the adjoint of the grid velocities."""
+        """Affine field of a particle's contribution to the adjoint of the grid velocities."""
         v = self.vector(state, after + AT_V, lane)
         x_bar = self.vector(bar, target, lane)
         v_bar = self.velocity_adjoint(x, v, x_bar, self.vector(bar, target + AT_V, lane))
@@ -254,7 +255,7 @@ class CudaPhases(OrderPhases, PosePhases):
         return out
 
     def range_of_series(self) -> list[float]:
-        """Return where series serve von Mises plasticity."""
+        """Return the range of the series for von Mises plasticity."""
         return [self.series.z_squared_max, self.series.j_min, self.series.j_max]
 
     @ti.func
@@ -318,8 +319,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def near_block(self, w, e, s, block):
-        """Bit mask of the manipulators that can reach a node of a block, of which a warp with all its lanes
-        has a part: each lane asks for one manipulator."""
+        """Bit mask of the manipulators within reach of a block. Each lane of the warp tests one
+        manipulator."""
         mask, lane = 0, w % WARP
         for shape, start, stop in ti.static(self.shape_ranges):
             if lane >= start and lane < stop:
@@ -331,8 +332,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def touching(self, e, s, x, near):
-        """Bit mask of the manipulators whose contact is not zero at a point in substep s; of more than a few
-        only those of the mask ``near`` are asked."""
+        """Bit mask of the manipulators with nonzero contact at a point in substep s; with many manipulators
+        only those in the mask ``near`` are tested."""
         mask = 0
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
@@ -358,8 +359,8 @@ class CudaPhases(OrderPhases, PosePhases):
     def retreat_through(
         self, e, start: ti.template(), m, actions: ti.template(), actions_bar: ti.template(), t
     ):
-        """Adjoint of one manipulator's motion in all substeps of environment step t, from what
-        :meth:`share_frame` has left."""
+        """Adjoint of one manipulator's motion in all substeps of environment step t, from the results of
+        :meth:`share_frame`."""
         bar = self.pose_bar[e, m]
         u = self.substep_motion(e, start, m, actions, t)
         total = vec7(0.0)
@@ -401,7 +402,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def take_poses(self, e):
-        """Add what the particles' distances have added up for an environment's poses to their adjoints."""
+        """Add the accumulated contributions of particle distances to the pose adjoints of an environment."""
         for m in range(self.manipulators):
             for i in ti.static(range(8)):
                 total = self.take_sum(self.pose_sums, (e * self.manipulators + m) * 8 + i)
@@ -409,7 +410,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def take_material(self, row):
-        """Add what an environment step has added up for a material to its adjoint."""
+        """Add the contributions accumulated in an environment step to the adjoint of a material."""
         for i in ti.static(range(self.coefficients)):
             self.material_bar[row, i] += self.take_sum(self.material_sums, row * self.coefficients + i)
 
@@ -424,8 +425,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def reduce_distances(self, e, m, group):
-        """Tally the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator, and join what the
-        lanes of a warp have tallied; all lanes of a warp take part."""
+        """Reduce the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator, then over the
+        lanes of a warp; all lanes of a warp must take part."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
         for k, _column, term in ti.static(self.distance_terms):
             tally = term.start()
@@ -489,16 +490,16 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def barrier_all(self, w):
-        """Wait until all resident threads are here, and have written what they write."""
+        """Wait until all resident threads have arrived and their writes are visible."""
         ti.simt.block.sync()
         if w % RESIDENT_BLOCK == 0:
-            # After a meeting of its block one thread's fence is one for what all have written.
+            # After a block barrier, the fence of one thread covers the writes of the whole block.
             grid_memory_fence()
-            # What all blocks add turns the sign, so that nobody need begin anew.
+            # The increments of all blocks flip the sign, so the counter needs no reset.
             before = ti.atomic_add(self.arrivals[0], ti.select(w == 0, self.last_arrival, 1))
             while (before ^ look(ti.get_addr(self.arrivals, 0))) >= 0:
                 pass
-            # What others wrote must not be read from this processor's own cache.
+            # Writes of other processors must not be read from the local cache.
             grid_memory_fence()
         ti.simt.block.sync()
 
@@ -506,7 +507,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def scatter_thread(self, state: ti.template(), before, after, q, time, stamp, parts: ti.template()):
         """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part.
 
-        ``time`` is noted where the state is broken by what an integer cannot hold.
+        ``time`` is recorded if a value is outside the range of the integers.
         """
         e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q, parts)
         first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
@@ -548,7 +549,7 @@ class CudaPhases(OrderPhases, PosePhases):
         e, block, r = self.node_of(q)
         unit = self.momentum_scale(-1)
         total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
-        # A test of which of a few manipulators are near would cost a thread as much as contact with them.
+        # With few manipulators, testing their distance costs as much as computing contact.
         near = (1 << self.manipulators) - 1
         if ti.static(self.manipulators > MAX_TESTED_MANIPULATORS):
             near = self.near_block(w, e, s, block)
@@ -607,8 +608,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def bound_thread(self, state: ti.template(), bar: ti.template(), before, after, q):
-        """Bound what thread q's particle will add to the adjoint of the grid velocities; all lanes of a warp
-        take part, and all are of one environment."""
+        """Bound the contribution of thread q's particle to the adjoint of the grid velocities; all lanes of a
+        warp must take part and belong to one environment."""
         e, particle = self.particle_of(q)
         bits = 0
         if particle < self.particles:

@@ -1,14 +1,14 @@
-"""Bitcode of CUDA, and sums that many threads of a CUDA device add to, in whatever order it runs them.
+"""Atomic sums on CUDA, in floating point or deterministic, and bitcode for CUDA.
 
-Floating-point numbers round, so that a sum's last bits follow the order of its additions, which timing
-decides. Integers do not. A *deterministic* simulator therefore adds in fixed point: what particles scatter to
-a node is an integer of 64 bits, in units fine enough for float32; sums in float64 are several integers of
-different units each, which together hold any number to some 1e-29.
+Floating-point sums depend on the order of additions, which depends on timing. Sums of integers do not. A
+*deterministic* simulator therefore uses fixed point: scattered values are 64-bit integers, with units fine
+enough for float32; float64 sums consist of several integers with different units, which represent any number
+to about 1e-29.
 
-Bitcode is for what Taichi would make slow code of, or compile slowly. Of a float's address Taichi does not
-know that it is in global memory: its atomic addition asks the device, and waits for the answer;
-``codegen/cuda_global.ll`` knows. A particle's law and its sums over 27 nodes are some thousand statements,
-each of which Taichi looks for in all others; :mod:`plab.sim.codegen` writes them.
+Bitcode replaces code that Taichi compiles slowly or inefficiently. Taichi's atomic addition does not assume
+global memory and returns the old value, which costs time; ``codegen/cuda_global.ll`` avoids both. A law and
+the sums over 27 nodes have about a thousand statements, for which Taichi's passes are slow;
+:mod:`plab.sim.codegen` generates them instead.
 """
 
 import math
@@ -24,23 +24,24 @@ MOMENTUM_BITS, MASS_BITS = 36, 42
 """Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""
 
 LARGEST_MOMENTUM = 2.0**13
-"""Momentum [particle mass x domain units / s] up to which a particle's share can be added to a node, with
-2^13 others; no state that is not broken has more."""
+"""Largest contribution of a particle to a node's momentum [particle mass x domain units / s], of which 2^13
+can be added; larger values occur only in diverged states."""
 
 ADJOINT_BITS = 46
-"""Bits of a share of a node's adjoint below the environment's largest: 2^15 largest ones can be added."""
+"""Bits of a contribution to a node's adjoint, relative to the largest of the environment: 2^15 largest ones
+can be added."""
 
 WORD_UNITS = (2.0**30, 2.0**-12, 2.0**-54, 2.0**-96)
-"""Units of the integers that make up a sum; one more says that it is not finite."""
+"""Units of the integers of a sum; an additional integer marks non-finite sums."""
 
 LARGEST_TERM = 2.0**72
-"""From here on a term of a sum counts as infinite."""
+"""Terms of a sum above this value count as infinite."""
 
 NOT_FINITE = 0x7F800000
 """Bits of a float32 from which on it is infinite or NaN, its sign left out."""
 
 LEAST_EXPONENT = -80
-"""Adjoints below 2^-80 have the units of that."""
+"""Adjoints below 2^-80 use the units of 2^-80."""
 
 
 def atomic(name: str, kind: Any) -> Callable[..., None]:
@@ -50,14 +51,14 @@ def atomic(name: str, kind: Any) -> Callable[..., None]:
 
 @ti.func
 def add(kind: ti.template(), address, value):
-    """Add to a number at an address, which nobody waits for."""
+    """Add to a number at an address, without returning the old value."""
     place, number = ti.cast(address, ti.u64), ti.cast(value, kind)
     ti.static(atomic("add", kind))(place, number)
 
 
 @ti.func
 def look(address):
-    """The 32-bit integer at an address, which others change meanwhile."""
+    """Read a 32-bit integer that other threads may change concurrently."""
     place, number = ti.cast(address, ti.u64), 0
     ti.static(atomic("look", ti.i32))(place, number)
     return number
@@ -65,7 +66,7 @@ def look(address):
 
 @ti.func
 def variables(real: ti.template(), values: ti.template()):
-    """Local variables that hold some numbers: what bitcode takes."""
+    """Return local variables with the given values, as arguments of bitcode functions."""
     return [local_variable(ti.cast(value, real)) for value in values]
 
 
@@ -81,10 +82,10 @@ def gather_sums(
     q: ti.template(),
     h: ti.template(),
 ):
-    """Return what a particle's adjoint needs of the grids of velocities and of the momentum's adjoint, given
-    the addresses of its base node in them: sums of w p and of w p times the node's offset (0, 1, 2) along x,
-    y and z, 3 components each, and the sum of grad_f w (p . q + velocity . h) over nodes, for affine fields
-    ``q`` and ``h``: value at the base node and increments along x, y, z."""
+    """Return sums over the stencil of a particle for its adjoint, given the addresses of its base node in the
+    grids of velocities and of the momentum adjoint p: sums of w p and of w p times the node's offset (0, 1,
+    2) along x, y and z, 3 components each, and the sum of grad_f w (p . q + velocity . h), for affine fields
+    ``q`` and ``h`` (value at the base node and increments along x, y, z)."""
     v, p, n = ti.u64(velocity), ti.u64(momentum), ti.i64(axis)
     weights = variables(real, [w[k][i] for k in range(3) for i in range(3)])
     slopes = variables(real, [dw[k][i] for k in range(3) for i in range(3)])
@@ -96,10 +97,10 @@ def gather_sums(
 
 
 class SumPhases(Storage):
-    """Sums by atomic additions; of integers where the simulator is deterministic.
+    """Atomic sums; integer sums in a deterministic simulator.
 
     Attributes:
-        adjoint_bound: Of each environment, what no share of a node's adjoint exceeds, see :meth:`bits_of`.
+        adjoint_bound: Upper bound on contributions to a node's adjoint, by environment; see :meth:`bits_of`.
     """
 
     adjoint_bound: ti.Field
@@ -124,7 +125,7 @@ class SumPhases(Storage):
             if ti.abs(value) < LARGEST_TERM:
                 rest = value
                 for k in ti.static(range(len(WORD_UNITS))):
-                    # Units are powers of two, and what is left is exact.
+                    # Units are powers of two, so the remainder is exact.
                     part = ti.cast(rest * ti.static(1.0 / WORD_UNITS[k]), ti.i64)
                     rest -= ti.cast(part, ti.f64) * ti.static(WORD_UNITS[k])
                     if part != 0:
@@ -168,8 +169,8 @@ class SumPhases(Storage):
     def add_to_grid(self, corner, number, component, value, scale: ti.template()):
         """Add to a number of a grid that is scattered to, counted from that at an address, ``corner``.
 
-        ``scale`` is a 4-vector of how many of the components' units make 1, as :meth:`momentum_scale` and
-        :meth:`adjoint_scale` return them.
+        ``scale`` is a 4-vector with the number of units per 1, from :meth:`momentum_scale` or
+        :meth:`adjoint_scale`.
         """
         place = corner + ti.static(self.node_bytes // 4) * ti.cast(ti.cast(number, ti.u32), ti.u64)
         if ti.static(self.deterministic):
@@ -202,8 +203,8 @@ class SumPhases(Storage):
 
     @ti.func
     def largest_share(self, field: ti.template()):
-        """Return an upper bound on the shares of the first three components of an affine field, see
-        :func:`plab.sim.particle_phases.affine_field`; not finite if a component is not."""
+        """Return an upper bound on the contributions of the first three components of an affine field, see
+        :func:`plab.sim.particle_phases.affine_field`; non-finite if a component is."""
         total = ti.abs(field[0]) + 2.0 * (ti.abs(field[1]) + ti.abs(field[2]) + ti.abs(field[3]))
         return total[0] + total[1] + total[2]
 

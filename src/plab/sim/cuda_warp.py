@@ -1,13 +1,12 @@
-"""Work that the threads of a warp share on CUDA: runs of particles in one cell, blocks of the grid read and
-written side by side, and the order of particles by cell that makes these runs long.
+"""Warp-level algorithms on CUDA: scatter by runs of particles in one cell, coalesced access to blocks of the
+grid, and sorting of particles by cell.
 
-The device moves 32 bytes at once. Threads that each read or write a 4-vector of their own, number by number,
-use a quarter of that, and atomics go as slowly. So neighbouring lanes take neighbouring numbers, and what
-belongs together meets in shared memory.
+Memory transactions have 32 bytes. If each thread reads or writes its own 4-vector, number by number, only a
+quarter is used, and atomics are equally slow. Therefore neighbouring lanes access neighbouring numbers, and
+values are exchanged in shared memory.
 
-Particles are put into the order of their cells before every environment step, by counting: how many particles
-each cell holds, where each cell's share begins, and which place that gives to each particle. The order within
-a cell depends on timing.
+Particles are sorted by cell before every environment step with a counting sort. The order within a cell
+depends on timing.
 """
 
 from plab.sim.compiler import ti
@@ -25,17 +24,16 @@ WARP = 32
 """Threads of a warp."""
 
 WARP_BLOCK = 128
-"""Threads of a block in loops that use shared memory."""
+"""Threads per block in loops with shared memory."""
 
 RUN_BITS = 5
-"""A run of particles in one cell is as long as a warp at most, 2^5."""
+"""Runs of particles in one cell have at most the length of a warp, 2^5."""
 
 ROW_STRIDE = 39
-"""Distance of what particles give in shared memory, 39 numbers each: odd, so that lanes meet different
-banks."""
+"""Stride between particles in shared memory, 39 numbers each; odd, to avoid bank conflicts."""
 
 WARP_NUMBERS = WARP * ROW_STRIDE + 27 * 4
-"""Numbers of a warp in shared memory: what its particles give, and a run's sums."""
+"""Numbers of a warp in shared memory: the data of its particles and the sums of a run."""
 
 BLOCK_WARPS = WARP_BLOCK // WARP
 """Warps of a block."""
@@ -47,7 +45,7 @@ NODE_BITS = 3 * BLOCK_BITS
 NODE_MASK = (1 << NODE_BITS) - 1
 
 NODE_STRIDE = 5
-"""Distance of nodes in shared memory, odd as well."""
+"""Stride between nodes in shared memory, odd as well."""
 
 
 @ti.func
@@ -59,8 +57,8 @@ def packed(a, b):
 
 @ti.func
 def masked_index(at):
-    """An index of shared memory, of which LLVM can tell that sums with it do not wrap: with a constant they
-    cost nothing."""
+    """Mask the upper bits of a shared-memory index, so that LLVM can prove that ``i + constant`` does not
+    overflow and fold the addition into the address."""
     return at & SHARED_MASK
 
 
@@ -128,7 +126,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def wait_for_warp(self):
-        """Let the lanes of the warp see what each other have written."""
+        """Make the writes of all lanes visible to the warp."""
         ti.simt.warp.sync(ti.u32(ALL_LANES))
 
     # -- blocks of the grid -------------------------------------------------------------------------
@@ -145,7 +143,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         ``unit`` has the units of the components, see :meth:`add_to_grid`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
-        # All are read before any is written: the device waits once, not four times.
+        # Read all before writing, so that the device waits once instead of four times.
         taken = ti.Vector.zero(self.real, 4)
         for turn in ti.static(range(4)):
             node = e * self.nodes + self.linear_in_block(block, r - lane + turn * 8 + lane // 4)
@@ -205,14 +203,14 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     # -- scatter by runs ----------------------------------------------------------------------------
     #
     # Particles are in the order of their cells at the start, and neighbours stay neighbours, so that the
-    # particles of a tile share few base nodes. A warp takes the particles of its tile in the order of their
-    # nodes; what a run of lanes with the same node adds to the grid is summed first. The sums are exact for
-    # any order of particles.
+    # particles of a tile share few base nodes. A warp processes the particles of its tile in the order of
+    # their nodes, and sums the contributions of a run of lanes with the same node first. The sums are exact
+    # for any order of particles.
 
     @ti.func
     def sorted_lane(self, state: ti.template(), source, place, own, lane):
-        """Return a lane's particle in the tile, the one whose base node is the lane-th in order,
-        of those at the ``place`` of each lane that has its ``own``; and whether the lane takes one."""
+        """Return the particle of a lane when the particles of a tile, one at the ``place`` of each lane with
+        ``own``, are sorted by base node; and whether the lane has one."""
         base, _fx = self.stencil(self.vector(state, source, place))
         node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.
@@ -222,7 +220,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 other = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), packed, 1 << step)
                 least, most = ti.min(packed, other), ti.max(packed, other)
                 packed = most
-                # A lane keeps the lesser where it is the lower of a rising pair or the upper of a falling.
+                # A lane keeps the smaller value if it is the lower of an ascending pair or the upper of a
+                # descending one.
                 if (lane >> stage) & 1 == (lane >> step) & 1:
                     packed = least
         return packed & (self.lanes - 1), packed < self.nodes * self.lanes
@@ -265,13 +264,13 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         """Scatter an affine field, weighted, to some components of a grid; every lane of the
         warp must take part. The field's fourth component is the same at all nodes.
 
-        What each lane's particle gives goes to shared memory, ``rows`` for ``BLOCK_WARPS * WARP_NUMBERS``
-        numbers. Then the lanes are the components of the nine columns of a run's stencil, and each sums what
-        the run's particles give to its three nodes. The sums change lanes once more, so that neighbours add
-        neighbouring numbers to the grid: the device takes up to 8 of them at once. ``heads`` and ``taking``
-        are those of :meth:`run_heads` for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_grid`.
-        If ``folded``, nodes are those of :meth:`folded_node`; ``folds`` has a bit for each axis along which
-        the base node is the first.
+        The data of each particle are written to shared memory, ``rows`` with ``BLOCK_WARPS * WARP_NUMBERS``
+        numbers. Then the lanes correspond to the components of the nine columns of a run's stencil, and each
+        sums the contributions of the run to its three nodes. Finally the sums are permuted, so that
+        neighbouring lanes add neighbouring numbers to the grid: the device combines up to 8 of them.
+        ``heads`` and ``taking`` are those of :meth:`run_heads` for the base nodes, ``node``; ``scale`` is
+        that of :meth:`add_to_grid`. If ``folded``, nodes are those of :meth:`folded_node`; ``folds`` has a
+        bit for each axis along which the base node is the first.
         """
         lane = q % WARP
         corner = ti.cast(q % WARP_BLOCK // WARP * WARP_NUMBERS, ti.i32)
@@ -351,14 +350,14 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
 
 class OrderPhases(WarpPhases):
-    """Finds an order of the particles, and moves states into it and back.
+    """Sorting of particles, and conversion of states to and from the sorted order.
 
-    A move is given by the former place of the particle at each place, ``moves[t * threads + q]`` for
-    environment step t and the thread q of the particle.
+    A permutation is stored as the former place of the particle at each place, ``moves[t * threads + q]`` for
+    environment step t and thread q.
     """
 
     def allocate_order(self) -> None:
-        """Allocate what finding an order needs, once."""
+        """Allocate the fields for sorting, once."""
         if hasattr(self, "cell_count"):
             return
         self.cell_count = ti.field(ti.i32, shape=self.batch * self.nodes)
@@ -462,7 +461,7 @@ class OrderPhases(WarpPhases):
         t,
         q,
     ):
-        """Fetch the state that step t's order has at thread q's place."""
+        """Fetch the state at thread q's place in the order of step t."""
         e, place = self.particle_of(q)
         origin = moves[t * self.particle_threads + q]
         read = self.tile_entry(source_slot, e, origin // self.lanes)

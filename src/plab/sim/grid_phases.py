@@ -16,22 +16,22 @@ from plab.sim.storage import (
 from plab.sim.tensors import Array
 
 MASS_MIN = 1e-12
-"""Nodes with less mass are skipped."""
+"""Nodes with a smaller mass are skipped."""
 
 STRENGTH_MIN = 0.1
-"""Soft contact of less strength is not applied."""
+"""Weaker soft contact is not applied."""
 
 WALL = 3
 """Nodes this close to a face of the domain belong to the wall."""
 
 STICKING = 10.0
-"""From this floor friction on, the floor sticks."""
+"""Floor friction at and above which the floor sticks."""
 
 
 @ti.func
 def with_friction(t, rn, friction):
-    """Tangential velocity t, a 3-vector or 2-vector in the surface's own axes, after full contact: shortened
-    by friction times the normal velocity rn that is lost, which is negative, towards the surface."""
+    """Tangential velocity t, a 3-vector or 2-vector in surface axes, after Coulomb friction; ``rn`` is the
+    normal velocity towards the surface, which is negative."""
     length = t.norm()
     factor = 0.0 * friction
     if length + rn * friction > 0.0 and length > 0.0:
@@ -149,7 +149,7 @@ class GridPhases(Storage):
         d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
         strength = self.strength(e, d)
         if strength > 0.0:
-            # What touches a manipulator that cannot move does not touch an action.
+            # Contact with static manipulators does not depend on actions.
             if ti.static(MANIPULATOR_SHAPES[shape].moves):
                 self.note_contact(e)
             normal = self.out_of_frame(shape, e, s, m, n_local)
@@ -265,7 +265,7 @@ class GridPhases(Storage):
 
     @ti.func
     def has_floor_friction(self, i, v, friction):
-        """Return True if the floor acts on a node, beyond stopping it as any wall does."""
+        """Return True if floor friction acts on a node."""
         return friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
 
     @ti.func
@@ -374,7 +374,8 @@ class GridPhases(Storage):
                     for back in range(stop - start):
                         m = stop - 1 - back
                         if near & (1 << m):
-                            # Few manipulators are near a node: what precedes m is cheaper redone than stored.
+                            # Few manipulators are near a node, so recomputing contact with those before m is
+                            # cheaper than storing it.
                             v_in = self.after_manipulators(e, s, x, free, near, m)
                             v_bar = self.contact_adjoint(shape, grid_index, e, s, m, x, v_in, v_bar)
             mass_bar = 0.0 * total[3]

@@ -219,7 +219,7 @@ def quaternion(pose):
 def with_unit_rotation(pose):
     """A pose, its rotation made a unit quaternion.
 
-    Actions turn it at a constant length, so that their gradient need not know.
+    Actions preserve its length, so the gradient with respect to actions is unaffected.
     """
     q = quaternion(pose)
     out = pose
@@ -231,8 +231,8 @@ def with_unit_rotation(pose):
 class PosePhases(Storage):
     """Poses within one environment step and the frames in which contact is computed.
 
-    What differs between shapes is compiled for each of the ``shape_ranges``: ``start`` is the first of those
-    that manipulator ``m`` is in.
+    Shape-dependent code is compiled for each of the ``shape_ranges``: ``start`` is the first of those that
+    manipulator ``m`` is in.
     """
 
     @ti.func
@@ -255,7 +255,7 @@ class PosePhases(Storage):
 
     @ti.func
     def note_step(self, e, t):
-        """Note that environment step t starts before the first contact, if it does."""
+        """Record environment step t if it starts before the first contact."""
         if self.touched[e] == 0:
             self.untouched_step[e] = t
 
@@ -291,8 +291,8 @@ class PosePhases(Storage):
 
     @ti.kernel
     def place(self, poses: Array, slot: ti.i32, now: Array, fresh: ti.i32):
-        """Take slot ``slot`` of the pose history as the end of an environment step, for the losses, and copy
-        it to slot 0 of ``now``; if ``fresh``, nothing has gone wrong or been touched before."""
+        """Use slot ``slot`` of the pose history as the end of an environment step, for the losses, and copy
+        it to slot 0 of ``now``; if ``fresh``, clear failures and contacts."""
         for e in range(self.batch):
             if fresh != 0:
                 self.fault[e] = 0

@@ -26,7 +26,7 @@ SIZES = {ti.f32: 4, ti.f64: 8}
 """Bytes of a number."""
 
 TYPE_SUFFIXES = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
-"""Endings of the names of functions of bitcode."""
+"""Suffixes of the names of bitcode functions."""
 
 
 @ti.func
@@ -56,14 +56,15 @@ def column(a: ti.template(), j: ti.template(), scale):
 @ti.func
 def at_base(value, row: ti.template(), f: ti.template(), scale):
     """One component of an affine field at the base node, from its value at the particle and its row of the
-    matrix A, whose factor times the grid spacing is ``scale``; numbers or lanes."""
+    matrix A; ``scale`` is the factor of A times the grid spacing. For numbers or lanes."""
     return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
 
 
 @ti.func
 def affine_field(value, last, a: ti.template(), f, scale):
-    """An affine field, value at the base node and increments, from its value (3) at the particle, the fourth
-    entry at the base node, and the matrix A (9), whose factor times the grid spacing is ``scale``."""
+    """An affine field, as value at the base node and increments, from its value (3) at the particle, the
+    fourth entry at the base node, and the matrix A (9); ``scale`` is the factor of A times the grid
+    spacing."""
     base = [at_base(value[i], [a[3 * i], a[3 * i + 1], a[3 * i + 2]], f, scale) for i in range(3)]
     return [widen(base, last), column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
 
@@ -77,14 +78,14 @@ class ParticlePhases(Storage):
     """Material update, particle-to-grid and grid-to-particle transfers and their adjoints.
 
     Attributes:
-        code_device: Device whose bitcode the phases call.
+        code_device: Device of the bitcode.
     """
 
     code_device: str
 
     def function(self, unit: int | str, name: str, real: Any = None) -> Callable[..., None]:
-        """Return a function of a law, by its number, or of ``transfers`` or ``atomics``, in the simulator's
-        precision or another; it takes local variables."""
+        """Return a bitcode function of a law, given by its number, or of ``transfers`` or ``atomics``, in the
+        simulator's precision or another; its arguments are local variables."""
         # Not the law itself: Quadrants passes a dataclass field by field.
         part = self.laws[unit] if isinstance(unit, int) else unit
         precision = "f32" if self.real == ti.f32 else "f64"
@@ -132,8 +133,8 @@ class ParticlePhases(Storage):
 
     @ti.kernel
     def observe(self, state: Array, slot: ti.i32, order: Array, stride: ti.i32, out: Array):
-        """Write position and velocity of every ``stride``-th particle of a time slot, as ``order`` numbers
-        them."""
+        """Write position and velocity of every ``stride``-th particle of a time slot, numbered by
+        ``order``."""
         for q in range(self.batch * self.tiles * self.lanes):
             e, place = self.particle_of(q)
             number = order[q]
@@ -157,8 +158,7 @@ class ParticlePhases(Storage):
 
     # -- transfers ----------------------------------------------------------------------------------
     #
-    # Of one particle, all axes at a time, or of the lanes of a tile along one axis: what takes vectors takes
-    # either.
+    # The functions apply to one particle with all axes, or to the lanes of a tile along one axis.
 
     @ti.func
     def unclamped(self, x, v):
@@ -168,13 +168,13 @@ class ParticlePhases(Storage):
 
     @ti.func
     def velocity_adjoint(self, x, v, x_bar, v_bar):
-        """Adjoint of the gathered velocity v, with what the new position adds to it."""
+        """Adjoint of the gathered velocity v, including the contribution of the new position."""
         return v_bar + self.dt * (self.unclamped(x, v) * x_bar)
 
     @ti.func
     def note_speed(self, speed, e, time):
-        """Note the time if a particle's squared speed is not sane."""
-        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
+        """Record the time if a particle's squared speed is implausible or NaN."""
+        # A speed above one domain per substep counts as divergence, as does NaN, which fails this comparison.
         if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
             self.fault[e] = time + 1
 
@@ -276,7 +276,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def neighbour(self, block, corner: ti.template()):
-        """Linear index of the block one further along the axes whose bits are set in ``corner``."""
+        """Linear index of the next block along the axes with bits set in ``corner``."""
         shift = ti.static(
             (corner & 1) * self.blocks_per_axis**2
             + ((corner >> 1) & 1) * self.blocks_per_axis

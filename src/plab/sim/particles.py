@@ -1,9 +1,8 @@
 """Particles of all environments on the device: their state in tiles, and their order in memory.
 
-At first the order follows a Hilbert curve through the grid. Neighbours on the curve are neighbours in space,
-however the grid's cells come to lie over them later: particles that are close in memory go on to share grid
-nodes while the plasticine moves and deforms. With many particles on CUDA they are sorted by cell before
-every environment step.
+Initially the order follows a Hilbert curve through the grid, so that particles close in memory share grid
+nodes, also after the plasticine has moved and deformed. With many particles on CUDA they are sorted by cell
+before every environment step.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ PARTS = 4
 
 
 def hilbert_index(cell: np.ndarray, bits: int) -> np.ndarray:
-    """Position of cells along a three-dimensional Hilbert curve.
+    """Return the index of cells along a three-dimensional Hilbert curve.
 
     After J. Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707 (2004).
 
     Args:
         cell: Cells, non-negative integers below 2^bits, shape [cell, 3].
-        bits: Bits per axis, at most 20.
+        bits: Number of bits per axis, up to 20.
 
     Returns:
         Index along the curve, in [0, 8^bits), shape [cell], int64.
@@ -45,7 +44,7 @@ def hilbert_index(cell: np.ndarray, bits: int) -> np.ndarray:
         below = bit - 1
         for axis in range(3):
             inside = (x[axis] & bit) != 0
-            # Either turn the lower bits of the first axis over, or exchange them with this axis's.
+            # Either invert the lower bits of the first axis, or swap them with those of this axis.
             exchange = np.where(inside, 0, (x[0] ^ x[axis]) & below)
             x[0] ^= np.where(inside, below, exchange)
             x[axis] ^= exchange if axis else 0
@@ -63,7 +62,7 @@ def hilbert_index(cell: np.ndarray, bits: int) -> np.ndarray:
 
 
 def curve_order(x: np.ndarray, n: int) -> np.ndarray:
-    """Permutation that puts particles into the curve's order.
+    """Return the permutation that sorts particles along the curve.
 
     Args:
         x: Positions [domain units], shape [particle, 3].
@@ -72,7 +71,7 @@ def curve_order(x: np.ndarray, n: int) -> np.ndarray:
     Returns:
         Number of the particle at each place, shape [particle].
     """
-    # Cells are those of the particles' base nodes, of which the lowest is -1.
+    # Cells are those of the base nodes, numbered from -1.
     cell = np.floor((x * n + 0.5) * PARTS).astype(np.int64)
     return np.argsort(hilbert_index(cell, int(PARTS * (n + 1)).bit_length()), kind="stable")
 
@@ -87,7 +86,7 @@ class ParticleOrder:
     """
 
     def __init__(self, engine: Any) -> None:
-        """Allocate; :meth:`start_from` comes next. ``engine`` is the CPU's or CUDA's kernels."""
+        """Allocate; call :meth:`start_from` next. ``engine`` has the kernels of the CPU or CUDA."""
         self._engine = engine
         self.numbers = self.allocate(1)
         if engine.sorts:
@@ -96,7 +95,7 @@ class ParticleOrder:
             self._moves = self.allocate(1)
 
     def start_from(self, positions: Sequence[np.ndarray]) -> None:
-        """Start with the curve's order of each environment's positions [domain units], [particle, 3]."""
+        """Set the initial order from the positions of each environment [domain units], [particle, 3]."""
         engine = self._engine
         self.initial = np.stack([curve_order(x, engine.n) for x in positions])
         batch, particles = self.initial.shape
@@ -133,7 +132,7 @@ class ParticleOrder:
         return out.reshape(batch, -1)[:, :particles].astype(np.int64)
 
     def noted(self) -> ti.Ndarray:
-        """Return :attr:`numbers` as they are now, whatever order comes next."""
+        """Return a snapshot of :attr:`numbers`."""
         if not self._engine.sorts:
             return self.numbers
         copy = self.allocate(1)
@@ -150,8 +149,8 @@ class ParticleOrder:
         stamp: int,
         moves: ti.Ndarray | None = None,
     ) -> None:
-        """Put a state into the order of its cells, in another array or time slot, and take that as the
-        current order; ``moves``, the order's own with room for step 0 if None, is written for step t."""
+        """Sort a state by cell into another array or time slot, and make this the current order; ``moves``,
+        by default the order's own for step 0, is written for step t."""
         moves = self._moves if moves is None else moves
         self._engine.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
         self.numbers, self._spare = self._spare, self.numbers
@@ -164,7 +163,7 @@ class Particles:
     Attributes:
         engine: The kernels.
         current: Tiles of the current state, in the order ``order``.
-        order: Which particle is at which place.
+        order: Particle order.
     """
 
     def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
@@ -172,7 +171,7 @@ class Particles:
         self.engine = engine
         self.order = ParticleOrder(engine)
         self.current = self.array(1)
-        # Where the current state goes when its particles are put into another order.
+        # Destination of the current state when its particles are sorted.
         self._spare = self.array(1) if engine.sorts else None
         self._numpy_real = numpy_real
         self._stamp = 0
@@ -192,7 +191,8 @@ class Particles:
         return self.slot_entries * np.dtype(self._numpy_real).itemsize
 
     def new_stamps(self, count: int) -> int:
-        """The first of ``count`` fresh stamps, which tell the marks of one scatter from those before."""
+        """Return the first of ``count`` new stamps, which distinguish the marks of one scatter from earlier
+        ones."""
         if self._stamp + count >= STAMP_MAX:
             self.engine.block_stamp.fill(0)
             self.engine.mark_stamp.fill(0)
@@ -213,7 +213,7 @@ class Particles:
         moves: ti.Ndarray | None = None,
     ) -> None:
         """Advance the current state by environment step t, in place, from one entry of the pose history to
-        another; ``moves`` keeps the step's order of the particles, if it is needed later."""
+        another; ``moves`` stores the particle order of the step if it is needed later."""
         if self.engine.sorts:
             entry = 0 if moves is None else t
             self.order.sort(self.current, 0, self._spare, 0, entry, self.new_stamps(1), moves)
@@ -242,7 +242,8 @@ class Particles:
     # -- to and from the host -----------------------------------------------------------------------
 
     def pack(self, state: State) -> np.ndarray:
-        """User arrays to tiles in the initial order, the last tile padded with particles at rest."""
+        """Convert user arrays to tiles in the initial order; the last tile is padded with particles at
+        rest."""
         engine = self.engine
         b, n = engine.batch, engine.particles
         flat: np.ndarray = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
@@ -254,8 +255,8 @@ class Particles:
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
     def unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray | None = None) -> State:
-        """Tiles of one state to user arrays, with poses to go with them; ``order`` of the particles is the
-        current one if None, shape [batch, particle]."""
+        """Convert the tiles of one state to user arrays, with poses; ``order``, shape [batch, particle], is
+        by default the current order."""
         engine = self.engine
         b, n = engine.batch, engine.particles
         order = self.order.current() if order is None else order

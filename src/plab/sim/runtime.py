@@ -26,21 +26,22 @@ from plab.sim.compiler import (
 )
 
 CACHE_BYTES = 1 << 30
-"""Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
+"""Size limit of Taichi's cache of compiled kernels in the user's cache folder."""
 
 STALE_LOCK_SECONDS = 10.0
-"""Age from which the lock of Taichi's cache is a killed process's: it is held while files are written."""
+"""Age after which the lock of Taichi's cache is considered stale; it is normally held only while files are
+written."""
 
 
 class DeviceError(PlabError, RuntimeError):
-    """The requested device is not there; the message says what to do."""
+    """The requested device is not available; the message states the remedy."""
 
 
 class SimulationError(PlabError, RuntimeError):
-    """The state or a gradient stopped being finite; the message says where and when.
+    """State or gradient became non-finite; the message states the environment and the time.
 
     Attributes:
-        failures: Which environments broke off, and when and why.
+        failures: Diverged environments, with time and reason.
     """
 
     def __init__(self, message: str, failures: Mapping[int, str] | None = None) -> None:
@@ -77,35 +78,34 @@ _thread: int | None = None
 
 
 def available_threads() -> int:
-    """CPUs that this process may use; ``OMP_NUM_THREADS``, as launchers set it, can make it fewer."""
+    """Number of CPUs available to this process, limited by ``OMP_NUM_THREADS``."""
     cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wish = os.environ.get("OMP_NUM_THREADS", "")
     return min(cpus, int(wish)) if wish.isdigit() and int(wish) > 0 else cpus
 
 
 def start_runtime(device: str, precision: str, threads: int | None = None) -> Runtime:
-    """Initialise Taichi, or reuse what is there if it is the same.
+    """Initialise Taichi, or reuse it if the settings are unchanged.
 
-    Taichi is initialised once per process; another device, precision or number of threads starts it anew,
-    which invalidates every simulator made before.
+    Taichi is initialised once per process. Another device, precision or number of threads reinitialises it,
+    which invalidates all existing simulators.
 
     Args:
         device: ``cpu`` or ``cuda``.
         precision: ``float32`` or ``float64``.
-        threads: CPU threads; all that the process may use if None.
+        threads: CPU threads; default: all available.
 
     Returns:
         The runtime in force.
 
     Raises:
-        DeviceError: If CUDA was asked for and is not there.
+        DeviceError: If CUDA is not available.
         ValueError: If a name is unknown.
-        RuntimeError: If this process was forked from one that has started Taichi, or another thread has
-            started it.
+        RuntimeError: If Taichi was started in a parent process or in another thread.
     """
     global _current, _thread
     _refuse_fork()
-    # Taichi makes fields in the thread that has initialised it, and aborts in others.
+    # Taichi can create fields only in the thread that initialised it, and aborts in others.
     if _thread not in (None, threading.get_ident()):
         raise RuntimeError("make all environments and simulators in one thread: Taichi is started in another")
     _thread = threading.get_ident()
@@ -114,11 +114,11 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     if precision not in PRECISIONS:
         raise ArgumentError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     wanted = 1 if device == "cuda" else max(1, threads or available_threads())
-    # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so
-    # that the next one starts from a fresh count when nothing is left of those before.
+    # Taichi's cache identifies kernels by the numbers of fields, so the count restarts when no simulator is
+    # left.
     if _current is not None and len(_users) > 0:
         if (_current.device, _current.precision, _current.threads) == (device, precision, wanted):
-            # Some may only wait for Python to collect them.
+            # Some may only await garbage collection.
             gc.collect()
             if len(_users) > 0:
                 return _current
@@ -141,7 +141,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
 def _refuse_fork() -> None:
     global _process
     if _process not in (None, os.getpid()):
-        # Taichi would wait for its threads, which a fork leaves behind.
+        # Taichi would wait for its threads, which do not exist in a forked process.
         raise RuntimeError(
             "plab cannot be used in a process forked from one that uses it: start workers with the context "
             "'forkserver' or 'spawn', such as make_vec(..., vector_kwargs={'context': 'spawn'})"
@@ -150,9 +150,9 @@ def _refuse_fork() -> None:
 
 
 def remove_stale_cache_lock() -> None:
-    """Remove the lock that a process killed while it wrote compiled kernels has left in Taichi's cache.
+    """Remove a stale lock from Taichi's cache, left by a process that was killed while writing kernels.
 
-    Taichi waits for it a fifth of a second, and would then compile every kernel anew in every later process.
+    Taichi waits a fifth of a second for it, and would then recompile all kernels in every later process.
     """
     lock = cache_lock()
     with contextlib.suppress(OSError):
@@ -173,13 +173,13 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         offline_cache=True,
         # The suite's kernels need more than Taichi's own 100 MB, and would be removed and compiled in turns.
         offline_cache_max_size_of_files=CACHE_BYTES,
-        # Its warnings are of a cache that another process is writing; these kernels are then not kept.
+        # Suppress warnings about a cache in use by another process; kernels are then not cached.
         log_level=ti.ERROR,
     )
 
 
 def cuda_driver() -> ctypes.CDLL | None:
-    """Return the CUDA driver, ready to answer; None if this computer has none."""
+    """Return the initialised CUDA driver; None if there is none."""
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -188,12 +188,12 @@ def cuda_driver() -> ctypes.CDLL | None:
 
 
 def in_use() -> Runtime | None:
-    """Return the runtime that simulators depend on which are still there; None without any."""
+    """Return the runtime of existing simulators; None without any."""
     return _current if len(_users) > 0 else None
 
 
 def register_user(user: object) -> None:
-    """Note that an object holds memory of the runtime, for as long as it lives."""
+    """Register an object that holds memory of the runtime."""
     _users.add(user)
 
 

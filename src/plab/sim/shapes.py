@@ -1,7 +1,7 @@
-"""Signed distances of the manipulators in their own frames, with what the adjoint of contact needs of them.
+"""Signed distances of manipulators in their own frames, with normals and Hessian products.
 
-Every shape of :data:`plab.scenes.MANIPULATOR_SHAPES` has its functions of a local point in :data:`SURFACES`.
-All distances are exact, so the normal, their gradient, has length 1, and the broad phase may rely on it.
+:data:`SURFACES` has the functions of each shape of :data:`plab.scenes.MANIPULATOR_SHAPES`. All distances are
+exact, so the normal, their gradient, has length 1, and the broad phase may rely on it.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,7 +14,7 @@ from plab.sim.compiler import ti
 
 @dataclass(frozen=True)
 class Surface:
-    """Functions of a shape that contact needs.
+    """Functions of a shape for contact.
 
     The functions take a local point [domain units], 3-vector; the shape's lengths in the order of
     ``MANIPULATOR_SHAPES[shape].size_names``, padded to a 3-vector; and the gap.
@@ -22,9 +22,9 @@ class Surface:
     Attributes:
         distance: Distance d, negative inside, and outward normal n = grad d, 3-vector.
         hessian_product: Hessian of d times a 3-vector, the last argument.
-        gap_slope: Derivative by the gap of the point's own x, relative to what is nearest of the shape, from
-            the point alone; only where the motion changes the gap.
-        round: Whether it is the same however it is turned.
+        gap_slope: Derivative of the x coordinate of the local point, relative to the nearest part of the
+            shape, with respect to the gap; only for motions that change the gap.
+        round: Whether the shape is invariant under rotations.
     """
 
     distance: Callable
@@ -243,7 +243,7 @@ SURFACES: dict[str, Surface] = {
     "Cylinder": Surface(cylinder_distance, cylinder_hessian_product),
     "Box": Surface(box_distance, box_hessian_product),
 }
-"""The surface of each of :data:`plab.scenes.MANIPULATOR_SHAPES`."""
+"""Surface of each shape of :data:`plab.scenes.MANIPULATOR_SHAPES`."""
 
 SURFACES |= {name: SURFACES[kind.outline] for name, kind in MANIPULATOR_SHAPES.items() if kind.outline}
 
@@ -270,5 +270,6 @@ def hessian_product(shape: ti.template(), p, size, gap, w):
 
 @ti.func
 def gap_slope(shape: ti.template(), p):
-    """Derivative of the local point's x, relative to what is nearest of the shape, by the gap."""
+    """Derivative of the x coordinate of the local point, relative to the nearest part of the shape, with
+    respect to the gap."""
     return SURFACES[shape].gap_slope(p)

@@ -56,8 +56,8 @@ INDEX_MASK = 2**30 - 1
 """Largest index into other fields on the CPU, all bits set; on CUDA grids are read in halves of a node, which
 are numbered in 32 bits."""
 
-# What follows are strides of the threads' working areas, which keep apart what two threads write: a cache
-# line that both of them use costs more than the work itself.
+# The following constants are strides of the threads' working areas. They prevent false sharing: a cache line
+# used by two threads costs more than the work itself.
 
 STENCILS = 32
 """Lane vectors per chunk for weights and affine fields of one tile; 27 are used."""
@@ -75,8 +75,8 @@ STRAINS = 56
 STRAIN_D, STRAIN_W, STRAIN_Z, STRAIN_SCALARS = 9, 15, 21, 27
 STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 31, 37, 39, 48, 51
 """Entries of a tile among these under von Mises plasticity, named as in :mod:`plab.laws.von_mises`: G is
-first; scalars are J, c2, a1, a2; bars those of J, c2; parameters mu, lambda and the yield strain, with
-adjoints of their own."""
+first; scalars are J, c2, a1, a2; bars those of J, c2; parameters mu, lambda and the yield strain, each with
+its adjoint."""
 
 LAW_PARAMETERS, LAW_PARAMETER_BARS, STRAIN_LAW = 0, 24, 54
 """Entries of a tile among these under other laws: coefficients, their adjoints; and under any, the number of
@@ -103,10 +103,10 @@ class Storage:
         deterministic: bool = False,
         singular_values: bool = False,
     ) -> None:
-        """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
-        data, for :meth:`fill_parameters`; gradients include those by initial state and material if
-        ``full_gradient``. The CPU is ``deterministic`` in any case. With ``singular_values`` the series of
-        :mod:`plab.laws.von_mises` serve no particle."""
+        """Allocate the fields of forward simulation for scenes that differ only in per-environment data,
+        which :meth:`fill_parameters` writes. With ``full_gradient`` gradients include those with respect to
+        initial state and material. The CPU is ``deterministic`` in any case. With ``singular_values`` the
+        series of :mod:`plab.laws.von_mises` serve no particle."""
         # Fields that the host reads or writes: number, field, components.
         self.shared: list[tuple[int, ti.Field, int]] = []
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
@@ -168,7 +168,8 @@ class Storage:
         self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)
 
     def moves(self, shape: str) -> bool:
-        """Return True if manipulators of this shape can move; decided while compiling, as what follows."""
+        """Return True if manipulators of this shape can move; evaluated at compile time, like the methods
+        below."""
         return MANIPULATOR_SHAPES[shape].moves
 
     def turns(self, shape: str) -> bool:
@@ -204,7 +205,7 @@ class Storage:
         self.minimal_gap = self.share(ti.field(ti.f64, shape=(b, m)))
         # Decay rate of the soft contact model; 0 is the hard one.
         self.alpha = self.share(ti.field(real, shape=b))
-        # Poses of one environment step, and what contact needs of them.
+        # Poses within one environment step, and the frames derived from them for contact.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
         self.frame_centre = ti.Vector.field(3, real, shape=(b, self.substeps, m))
         self.frame_rotation = ti.Matrix.field(3, 3, real, shape=(b, self.substeps, m))
@@ -231,7 +232,7 @@ class Storage:
         return ti.Vector.field(4, self.real, shape=nodes)
 
     def allocate_adjoint(self) -> None:
-        """Allocate what only gradients need, once."""
+        """Allocate the fields for gradients, once."""
         if not self.adjoint_sums:
             self._allocate_adjoint()
 
@@ -285,8 +286,8 @@ class Storage:
         return self.coefficients + (len(self.laws) > 1)
 
     def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:
-        """Write whose particles are where, by their numbers at each place, shape [batch, particle], and what
-        they are made of; nothing where all are of one material."""
+        """Write the body and the material of the particle at each place, given particle numbers of shape
+        [batch, particle]; no effect with a single material."""
         if not self.mixed:
             return
         places = self._bodies.reshape(self.batch, -1)[:, : self.particles]
@@ -296,10 +297,10 @@ class Storage:
         self.fill_material(scenes)
 
     def fill_laws(self, scenes: Sequence[Scene]) -> None:
-        """Write which laws each tile has; the CPU's tiles are asked for it."""
+        """Write the laws of each tile; used by the CPU."""
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
-        """Write everything in which environments may differ, terms of the loss excepted."""
+        """Write all per-environment data, except those of loss terms."""
         self.fill_material(scenes)
         if self.manipulators == 0:
             return

@@ -1,6 +1,4 @@
-"""Rollouts and the way back through them: states that are kept or computed again, recorded states, and
-closed-loop control.
-"""
+"""Rollouts and their backward pass: checkpointed states, recorded states, and closed-loop control."""
 
 from __future__ import annotations
 
@@ -26,9 +24,10 @@ if TYPE_CHECKING:
 class Tape:
     """Runs environment steps forward and back.
 
-    The steps are divided into segments. Of each but the last only the first state is kept on the way forward;
-    its other states are computed again on the way back, in the same order of the particles. A segment's
-    states are in as many arrays as it takes: Taichi cannot address more than :data:`ENTRIES_MAX` numbers.
+    The steps are divided into segments. In the forward pass only the first state of each segment is stored,
+    except for the last segment; the other states are recomputed in the backward pass, in the same particle
+    order. A segment may use several arrays, because Taichi cannot address more than :data:`ENTRIES_MAX`
+    numbers.
 
     Attributes:
         bar: Adjoint of the initial state after :meth:`backward`, in the initial order; None before the first.
@@ -51,13 +50,13 @@ class Tape:
 
     @property
     def _slots_per_step(self) -> int:
-        """Time slots of an environment step in the history. Where particles are put into another order, a
-        step's start is kept in its own order and in that of the step before."""
+        """Time slots per environment step in the history. If particles are sorted, the start of a step is
+        stored in both particle orders."""
         return self._engine.substeps + (1 if self._engine.sorts else 0)
 
     @property
     def _reach_max(self) -> int:
-        """Environment steps whose states fit into one array."""
+        """Number of environment steps whose states fit into one array."""
         slots = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
         return max(0, slots - 1) // self._slots_per_step
 
@@ -87,7 +86,7 @@ class Tape:
         slots = [part * self._slots_per_step + 1 for part in parts]
         held = [array.shape[0] // per_slot for array in self._history]
         if len(held) < len(slots) or any(has < needs for has, needs in zip(held, slots, strict=False)):
-            # Freed before others are allocated.
+            # Free the old arrays before allocating new ones.
             self._history.clear()
             self._history += [self._particles.array(count) for count in slots]
         if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * per_slot):
@@ -112,7 +111,7 @@ class Tape:
         length: int | None,
         after: Callable[[int, ti.Ndarray, int], None] | None = None,
     ) -> None:
-        """Run all steps from the current state and leave the last one there.
+        """Run all steps from the current state, which becomes the last state.
 
         Args:
             actions: Actions of all steps.
@@ -120,9 +119,8 @@ class Tape:
             terms: Measures after each step are written to it, from the second entry; None if
                 :meth:`backward`, which computes them anyway, is to do that.
             steps: Environment steps T.
-            length: What :meth:`plan` has returned, or None to keep nothing.
-            after: Called after each step with its number, and array and time slot of the state that it has
-                led to.
+            length: Result of :meth:`plan`, or None to store nothing.
+            after: Called after each step with its number, and array and time slot of the resulting state.
         """
         particles = self._particles
         self._length = length or steps
@@ -153,7 +151,7 @@ class Tape:
             self._engine.copy_slot(history, slot + self._engine.substeps, particles.current, 0)
 
     def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
-        """Run step t within the history; ``known`` tells that its order of the particles is."""
+        """Run step t within the history; ``known`` is True if its particle order is known."""
         history, slot = self._place(t)
         number, masked_index = divmod(t % self._length, self._reach)
         if number and not masked_index:
@@ -181,25 +179,25 @@ class Tape:
         add: Callable[[int, ti.Ndarray, int, ti.Ndarray], None] | None = None,
         actions_bar: ti.Ndarray | None = None,
     ) -> ti.Ndarray:
-        """Go back through the steps that :meth:`forward` has run with a length.
+        """Backpropagate through the steps of :meth:`forward`.
 
         Args:
             actions: Those of :meth:`forward`, as ``poses``.
             poses: Likewise.
             terms: Measures after each step are written to it, from the second entry.
             steps: Environment steps T.
-            contact_free: Steps at the start through which particles' adjoints need not be followed.
-            add: Called before each step with its number, array and time slot of the state that it has led to,
-                and that state's adjoint, to which it may add.
-            actions_bar: Array for the result, in which the adjoint of a step's actions stands when ``add`` is
-                called for the step before; a new one if None.
+            contact_free: Number of initial steps without contact, in which particle adjoints are not needed.
+            add: Called before each step with its number, array and time slot of the resulting state, and the
+                adjoint of this state, to which it may add.
+            actions_bar: Array for the result, complete for a step when ``add`` is called for the previous
+                step; default: a new array.
 
         Returns:
             Adjoint of the actions, laid out like these.
         """
         engine = self._engine
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape) if actions_bar is None else actions_bar
-        # Allocated on the way forward.
+        # Allocated in the forward pass.
         assert self.bar is not None
         engine.clear_adjoint(self.bar)
         last = (steps - 1) // self._length
@@ -230,14 +228,14 @@ class Tape:
 
 
 class RecordedStates:
-    """States after environment steps; arrays, or CUDA tensors where the actions were one.
+    """States after environment steps, as arrays, or as CUDA tensors if the actions were one.
 
     Attributes:
-        x: Particle positions [domain units], shape [batch, T, particle, 3]; T is 1 where the last state was
-            asked for.
+        x: Particle positions [domain units], shape [batch, T, particle, 3]; T is 1 if only the last state was
+            requested.
         v: Particle velocities, likewise.
         poses: Poses of the manipulators, as in :class:`plab.sim.State`, shape [batch, T, manipulator, 8].
-        mass: Mass tensors, shape [batch, T, n, n, n]; None if they were not asked for.
+        mass: Mass tensors, shape [batch, T, n, n, n]; None if not requested.
     """
 
     x: Any
@@ -246,19 +244,19 @@ class RecordedStates:
     mass: Any
 
     def __init__(self, particles: Particles, like: Any, every_step: bool, mass: bool, steps: int) -> None:
-        """Made by :meth:`plab.sim.Simulator.record`, without a state of the rollout's T ``steps`` yet; states
-        are tensors if ``like``, the actions, are a CUDA tensor."""
+        """Start without states for a rollout of T ``steps``, see :meth:`plab.sim.Simulator.record`. States
+        are tensors if the actions ``like`` are a CUDA tensor."""
         self._particles, self._engine = particles, particles.engine
         self._like = like if on_device(like) else None
         self._first = 0 if every_step else steps - 1
         self._rows: list[Any] = []
         self._masses: list[Any] | None = [] if mass else None
-        # Where particles change places: their numbers at each state.
+        # Particle numbers of each state, if particles are sorted.
         self._numbers: list[ti.Ndarray] = []
         self._bars: dict[str, Any] = {}
 
     def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Take the state that step t has led to from the device."""
+        """Copy the state after step t from the device."""
         if t < self._first:
             return
         engine, numbers = self._engine, self._particles.order.noted()
@@ -271,8 +269,8 @@ class RecordedStates:
             self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
 
     def finish(self, poses: Any, back: Callable[[], Any], is_current: Callable[[], bool]) -> RecordedStates:
-        """Offer what was noted, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the way back
-        while it ``is_current``."""
+        """Complete the recorded states, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the
+        backward pass, valid while ``is_current``."""
         e = self._engine
         rows = self._stacked(self._rows).reshape(e.batch, -1, e.particles, 6)
         self.x, self.v, self.poses, self.mass = rows[..., :3], rows[..., 3:], poses[:, self._first :], None
@@ -283,26 +281,27 @@ class RecordedStates:
         return self
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:
-        """Return the gradient with respect to the actions of a function whose derivatives by the states are
-        given.
+        """Return the gradient with respect to the actions of a function, given its derivatives with respect
+        to the states.
 
-        After it :meth:`plab.sim.Simulator.state_gradient` and :meth:`plab.sim.Simulator.material_gradient`
-        are those of the same function. The derivative by a quaternion is that of the rotation matrix's
-        polynomial.
+        Afterwards, :meth:`plab.sim.Simulator.state_gradient` and :meth:`plab.sim.Simulator.material_gradient`
+        return gradients of the same function. Derivatives with respect to quaternions are those of the
+        rotation matrix as a polynomial.
 
         Args:
-            x: Derivatives by the positions, shape as ``self.x``; None where they are 0, as all of these.
-            v: Derivatives by the velocities.
-            poses: Derivatives by the poses.
-            mass: Derivatives by the mass tensors.
+            x: Derivatives with respect to the positions, shape as ``self.x``; None, as for all arguments, if
+                they are 0.
+            v: Derivatives with respect to the velocities.
+            poses: Derivatives with respect to the poses.
+            mass: Derivatives with respect to the mass tensors.
 
         Returns:
             Shape [batch, T, action], like the actions.
 
         Raises:
             ValueError: If a shape is wrong.
-            RuntimeError: If the simulator has run or was set otherwise since, or was not to keep the way
-                back.
+            RuntimeError: If the simulator has been used or changed since, or the states were recorded without
+                gradient.
             SimulationError: If the gradient stops being finite.
         """
         given = {"x": x, "v": v, "poses": poses, "mass": mass}
@@ -319,7 +318,7 @@ class RecordedStates:
         return self._back()
 
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
-        """Add the derivatives by the state that step t has led to, in ``slot`` of an array, to its
+        """Add the derivatives with respect to the state after step t, in ``slot`` of an array, to its
         adjoint."""
         k = t - self._first
         if k < 0:
@@ -348,18 +347,18 @@ class RecordedStates:
         return np.stack(rows, axis=1) if self._like is None else sys.modules["torch"].stack(rows, dim=1)
 
     def _by_step(self, bar: Any) -> list[Any]:
-        """Derivatives by the states of each step as numbers one after the other that a kernel takes."""
+        """Return the derivatives with respect to the states of each step as flat arrays for kernels."""
         steps = bar.detach() if on_device(bar) else np.asarray(bar)
         return [_flat(steps[:, k]) for k in range(steps.shape[1])]
 
 
 class ClosedLoop:
-    """Environment steps whose actions are chosen from observations, and the way back through both.
+    """Environment steps with actions chosen from observations, and their backward pass.
 
     Attributes:
-        actions: Actions of all steps, as they are chosen.
-        actions_bar: Their adjoints, as they come to be known.
-        weights: Weights of the terms of the loss before the discount, shape [term]; set before the way back.
+        actions: Actions of all steps so far.
+        actions_bar: Adjoints of the actions computed so far.
+        weights: Weights of the loss terms before discounting, shape [term]; set before the backward pass.
     """
 
     weights: np.ndarray
@@ -378,9 +377,9 @@ class ClosedLoop:
         components: int,
         follow: Callable[[Any], LinkMotion] | None,
     ) -> None:
-        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array, ``follow``
-        moves the joints of articulated models by actions of so many ``components``, the rest is as in
-        :meth:`plab.sim.Simulator.closed_loop`."""
+        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array; ``follow``
+        moves the joints of articulated models by actions with ``components`` entries. Other arguments are as
+        in :meth:`plab.sim.Simulator.closed_loop`."""
         self._particles, self._engine = particles, particles.engine
         self._poses, self._steps, self._stride = poses, steps, stride
         self._choose, self._react, self._observe = choose, react, observe
@@ -392,11 +391,11 @@ class ClosedLoop:
         self._row = engine.batch * engine.actions_per_step
         self.actions = ti.ndarray(ti.f64, shape=max(1, steps * self._row))
         self.actions_bar = ti.ndarray(ti.f64, shape=self.actions.shape)
-        # Which particle was where when each observation was made.
+        # Particle order at each observation.
         self._numbers: list[ti.Ndarray] = []
 
     def observe_step(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Observe the state before step t, in a time slot of an array, and have its actions chosen."""
+        """Observe the state before step t, in a time slot of an array, and choose its actions."""
         engine = self._engine
         self._numbers.append(self._particles.order.noted())
         shape = engine.batch, engine.manipulators, 8
@@ -414,11 +413,11 @@ class ClosedLoop:
         return self._drives[-1].twists
 
     def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Look at the state that step t has led to."""
+        """Observe the state after step t."""
         self.observe_step(t + 1, state, slot)
 
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
-        """Add to the adjoint of the state that step t has led to what it does through its observation."""
+        """Add the contribution of the observation after step t to the adjoint of its state."""
         if self._discount != 1.0:
             self._engine.write(self._engine.term_weights, self.weights * self._discount**t)
         given = self.react_at(t + 1)
@@ -440,13 +439,15 @@ class ClosedLoop:
             engine.add_pose_cotangents(_flat(posed))
 
     def react_at(self, t: int) -> tuple[Any, Any] | None:
-        """Ask for the reaction to the adjoint of the actions of step t, or to the last observation."""
+        """Return the derivatives with respect to the observation before step t from the adjoint of its
+        actions, or those of the last observation."""
         if t == self._steps:
             return self._react(t, None)
         shape = self._engine.batch, self._engine.actions_per_step
         bar = numbers_of(self.actions_bar, shape, self._like, first=t * self._row)
         if self._drives:
-            # Steps are answered from the last to the first: later ones depend on the joints of earlier ones.
+            # Steps are processed from the last to the first, because later steps depend on the joints of
+            # earlier ones.
             by_actions, self._joints_bar = self._drives[t].pull_back(bar[None], self._joints_bar)
             bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
         return self._react(t, bar)

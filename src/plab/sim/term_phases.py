@@ -1,8 +1,8 @@
-"""Terms of a loss, and their sums over the state: mass tensor, particles, distances from the
-manipulators; and the way back from their slopes to the adjoints of particles and poses.
+"""Loss terms as sums over the mass tensor, the particles and the distances from manipulators, and their
+adjoints with respect to particles and poses.
 
-The terms themselves are elsewhere (:mod:`plab.losses`): each is an object with a few functions, which are
-compiled into the kernels here.
+The terms are defined in :mod:`plab.losses`, as objects with a few functions that are compiled into these
+kernels.
 
 The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to
 the layer below the domain counts at the face's node, so that the tensor holds all mass. The release's floor
@@ -24,8 +24,8 @@ from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
 
 EXTRA_MEASURES = 2
-"""Measures of a state after its terms: the largest mass of a node, and the fault: the number of the substep
-in which the state broke, from 1 on, or 0."""
+"""Measures of a state after its terms: the largest mass of a node, and the substep of divergence, counted
+from 1, or 0."""
 
 
 class LossTerm(Protocol):
@@ -46,12 +46,12 @@ class TermPhases(Storage):
     """The mass tensor, and sums of terms.
 
     Attributes:
-        shares: Parts of the particles that distances are tallied in before they are joined.
+        shares: Number of groups of particles in the reduction of distances.
         terms: The terms, in the order of their measures.
         node_terms: Those of the mass tensor: number among these, column among the measures, term.
         particle_terms: Those of the particles, likewise.
         distance_terms: Those of the distances.
-        references: Numbers per node of the targets that terms have asked for, by name.
+        references: Fields of the targets requested by terms, by name.
     """
 
     shares: int
@@ -67,7 +67,7 @@ class TermPhases(Storage):
             terms: Terms as in :mod:`plab.losses.term`, not attached before; those of weight 0 are left out.
         """
         weighted = [t for t in terms if t.weighted and t.weight != 0.0]
-        # Those that are measured only come last.
+        # Terms without weight, which are only measured, come last.
         self.terms = (*weighted, *(t for t in terms if not t.weighted))
         self.references: dict[str, ti.Field] = {}
         self.node_terms = self._with("empty")
@@ -91,7 +91,7 @@ class TermPhases(Storage):
 
     @property
     def measures(self) -> int:
-        """Numbers that a state is measured by: the terms', and :data:`EXTRA_MEASURES`."""
+        """Number of measures of a state: the terms and :data:`EXTRA_MEASURES`."""
         return len(self.terms) + EXTRA_MEASURES
 
     def reference(self, name: str) -> ti.Field:
@@ -146,7 +146,8 @@ class TermPhases(Storage):
 
     @ti.func
     def mass_slope(self, slopes: ti.template(), e, base, fx, dense: ti.template()):
-        """Gradient with respect to one particle's position of what the mass tensor's slopes are those of."""
+        """Gradient of the node terms with respect to one particle's position, from the slopes at the
+        nodes."""
         w = spline(fx)
         dw = spline_slope(fx)
         out = fx * 0.0
@@ -197,7 +198,8 @@ class TermPhases(Storage):
 
     @ti.func
     def particle_gradient(self, e, base, fx, x, v):
-        """Derivatives of the weighted terms of nodes and particles by a particle's position and velocity."""
+        """Derivatives of the weighted terms of nodes and particles with respect to a particle's position and
+        velocity."""
         x_bar = x * 0.0
         v_bar = x * 0.0
         if ti.static(len(self.node_terms) > 0):
@@ -274,7 +276,7 @@ class TermPhases(Storage):
 
     @ti.func
     def nearest_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
-        """Add the gradient of terms that look at the nearest particle alone to its adjoint and the poses'."""
+        """Add the gradient of terms of the nearest particle to its adjoint and those of the poses."""
         for k, _column, term in ti.static(self.distance_terms):
             if ti.static(term.nearest_only):
                 for shape, start, stop in ti.static(self.shape_ranges):
@@ -292,7 +294,7 @@ class TermPhases(Storage):
 
     @ti.func
     def distance_gradient(self, shape: ti.template(), e, m, particle, x):
-        """Adjoints of a particle's position and a manipulator's pose under terms that look at all
+        """Adjoints of a particle's position and a manipulator's pose under distance terms over all
         particles."""
         x_bar = x * 0.0
         pose_bar = vec8(0.0)
@@ -304,8 +306,8 @@ class TermPhases(Storage):
         return x_bar, pose_bar
 
     def acts(self, shape: str) -> bool:
-        """Return True if a shape's distances count in the loss: where an action can move it; decided while
-        compiling."""
+        """Return True if a shape's distances count in the loss, that is, if it can move; evaluated at compile
+        time."""
         return MANIPULATOR_SHAPES[shape].moves
 
     @property
@@ -350,8 +352,8 @@ class TermPhases(Storage):
 
     @ti.kernel
     def add_cotangents(self, bar: Array, order: Array, given: Array, first: ti.i32):
-        """Add derivatives by positions (``first`` is 0) or velocities (3), numbered as ``order`` says, to the
-        particles' adjoints."""
+        """Add derivatives with respect to positions (``first`` is 0) or velocities (3), in the order
+        ``order``, to the particle adjoints."""
         for q in range(self.batch * self.tiles * self.lanes):
             e, place = self.particle_of(q)
             if place < self.particles:
@@ -363,7 +365,7 @@ class TermPhases(Storage):
 
     @ti.kernel
     def add_mass_cotangents(self, state: Array, slot: ti.i32, bar: Array, given: Array):
-        """Add derivatives by the mass tensors, n^3 per environment, to the particles' adjoints."""
+        """Add derivatives with respect to the mass tensors, n^3 per environment, to the particle adjoints."""
         for q in range(self.batch * self.tiles * self.lanes):
             e, place = self.particle_of(q)
             if place < self.particles:
@@ -377,7 +379,7 @@ class TermPhases(Storage):
 
     @ti.kernel
     def add_pose_cotangents(self, given: Array):
-        """Add derivatives by the poses, 8 per manipulator, to the poses' adjoints."""
+        """Add derivatives with respect to the poses, 8 per manipulator, to the pose adjoints."""
         for e, m in self.pose_bar:
             for i in ti.static(range(8)):
                 self.pose_bar[e, m][i] += ti.cast(given[(e * self.manipulators + m) * 8 + i], ti.f64)

@@ -1,10 +1,11 @@
 """Files of LLVM bitcode that Taichi links into its kernels, written when first needed.
 
-A file has the functions of the transfers or of one law, for one device and one precision. It lies in plab's
-cache folder under a digest of its sources, since Taichi knows compiled kernels by the names of these files:
-an edited formula is another file, and compiles anew.
+A file has the functions of the transfers or of one law, for one device and one precision. Its name in plab's
+cache folder contains a digest of its sources. Taichi identifies compiled kernels by these names, so editing a
+formula triggers recompilation.
 
-Taichi 1.7 has LLVM 15, which reads what llvmlite 0.42 to 0.44 write; Quadrants has LLVM 22, as llvmlite 0.50.
+Taichi 1.7 has LLVM 15, compatible with bitcode from llvmlite 0.42 to 0.44; Quadrants has LLVM 22, as llvmlite
+0.50.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ PLATFORM = f"{sys.platform}-{platform.machine().lower()}"
 
 @functools.cache
 def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = False) -> str:
-    """Return the path of a file of bitcode, written if it is not there.
+    """Return the path of a bitcode file, which is written if it does not exist.
 
     Args:
         device: ``cpu`` or ``cuda``.
@@ -54,7 +55,7 @@ def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = Fal
         mixed: Whether lanes of a tile may have different laws.
 
     Raises:
-        plab.sim.DeviceError: If it has to be written, and llvmlite does not load; one line.
+        plab.sim.DeviceError: If the file must be written and llvmlite cannot be loaded.
     """
     code = None
     digest = hashlib.sha256(repr((_sources(), LAYOUTS.get(PLATFORM), device, precision, mixed)).encode())
@@ -96,7 +97,7 @@ def _temporary() -> Path:
 
 @functools.cache
 def _sources() -> bytes:
-    """Return a digest of what writes bitcode: plab's own files, and llvmlite."""
+    """Return a digest of the sources of bitcode: plab's own files and llvmlite."""
     folders = Path(__file__).parent, Path(laws.__file__).parent
     files = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix in (".py", ".ll")]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
@@ -148,7 +149,7 @@ def symbol(unit: Law | str, name: str, precision: str) -> str:
 
 
 def _unsupported(message: str) -> Exception:
-    # The simulator's runtime imports Taichi, which what writes bitcode does not need.
+    # Imported here, because it imports Taichi, which is not needed to write bitcode.
     from plab.sim.runtime import DeviceError
 
     return DeviceError(message)

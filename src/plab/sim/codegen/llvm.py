@@ -1,7 +1,7 @@
-"""Functions in LLVM's intermediate representation, written by numbers that record instructions.
+"""Functions in LLVM's intermediate representation, written by tracing operators of numbers.
 
 A :class:`Number` is a value of all lanes of a tile on the CPU, or of one particle on CUDA. Products and sums
-may be fused, which Taichi does not let LLVM do on CPUs.
+may be fused, which Taichi does not allow on CPUs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ Row = tuple[ir.Value, ir.Value]
 
 
 class Code:
-    """A function in the making: of addresses and numbers, which Taichi passes as local variables.
+    """A function under construction; its arguments are addresses and numbers, which Taichi passes as local
+    variables.
 
     Attributes:
         args: Their values by name.
@@ -75,7 +76,7 @@ class Code:
         return self._b.fdiv(a, b)
 
     def exp(self, a: ir.Value) -> ir.Value:
-        """Exponential: a power of two times a Taylor series, to a few units in the last place."""
+        """Exponential: a power of two times a Taylor series, accurate to a few units in the last place."""
         bits, bias, limit, terms = (23, 127, 87.0, 8) if self.single else (52, 1023, 708.0, 14)
         a = self.least(self.most(a, self.constant(-limit)), self.constant(limit))
         turns = self.mul(a, self.constant(1.0 / math.log(2.0)))
@@ -116,8 +117,8 @@ class Code:
         return self.add(self.mul(n, self.constant(high)), rest)
 
     def _ln2(self) -> tuple[float, float]:
-        """ln 2 as a sum whose first term has few digits, so that its products with small integers are
-        exact."""
+        """ln 2 as the sum of a term with few digits, for exact products with small integers, and a
+        remainder."""
         bits = 15 if self.single else 32
         high = math.ldexp(math.floor(math.ldexp(math.log(2.0), bits)), -bits)
         return high, math.log(2.0) - high
@@ -210,7 +211,7 @@ class Code:
         self._b.store(value, self._wide(self.at(pointer, entry * LANE), LANE), align=self._align)
 
     def put(self, name: str, value: ir.Value) -> None:
-        """Set a number that the caller reads."""
+        """Write an output of the function."""
         self._b.store(value, self.places[name])
 
     def end(self) -> None:
@@ -273,7 +274,7 @@ class Code:
 
 
 class Scalars(Code):
-    """A function whose numbers are one particle's, and whose parts may be left out at run time."""
+    """A function of the numbers of one particle, with parts that may be skipped at run time."""
 
     def constant(self, number: float) -> ir.Value:
         return self.real(number)
@@ -334,7 +335,7 @@ class Number:
         return self._operation("sub", other, self)
 
     def __mul__(self, other: Number | float) -> Any:
-        # Zeros that only say of which kind a number is.
+        # Zeros that represent the type of a number.
         return (
             other
             if _equals(other, 0.0)

@@ -1,11 +1,10 @@
 """Material updates and their adjoints, for a tile of particles on the CPU and for one particle on CUDA.
 
 Any law is an update from C and F to A and the new F, and its adjoint, traced. von Mises plasticity has a
-schedule of its own, in parts: a tile in which nothing yields skips plastic flow, the adjoint takes the strain
-from where the forward part has left it, and strains beyond the range of the series are left to singular
-values.
+schedule of its own, in parts: tiles without yielding particles skip plastic flow, the adjoint reuses the
+strain of the forward part, and strains outside the range of the series use singular values.
 
-Adjoints are named after what they belong to, with ``_bar``.
+Adjoints have the suffix ``_bar``.
 """
 
 from __future__ import annotations
@@ -91,7 +90,8 @@ def stress_adjoint(
     stress_scale: Any,
     series: algebra.Series,
 ) -> tuple[list[Any], Any, Any, list[Any]]:
-    """Return the adjoints of d (6), c2, J and the parameters (3) by the stress, from that of A (9)."""
+    """Return the contributions of the stress to the adjoints of d (6), c2, J and the parameters (3), from the
+    adjoint of A (9)."""
     trace = Trace()
     inputs = [*trace.inputs("d", 6), *trace.inputs("scalars", 2), *trace.inputs("parameters", 3)]
     bars, [scale] = trace.inputs("a_bar", 9), trace.inputs("scale", 1)
@@ -106,7 +106,8 @@ def stress_adjoint(
 def flow_adjoint(
     d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: algebra.Series
 ) -> tuple[list[Any], list[Any], Any]:
-    """Return the adjoints of d (6), G (9) and the yield strain by plastic flow, from that of the new F."""
+    """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain, from the
+    adjoint of the new F."""
     trace = Trace()
     inputs = [*trace.inputs("d", 6), *trace.inputs("g", 9), *trace.inputs("yield_strain", 1)]
     bars = trace.inputs("f_bar", 9)
@@ -124,7 +125,7 @@ def strain_adjoint(
     bars: Sequence[Any],
     series: algebra.Series,
 ) -> tuple[list[Any], list[Any]]:
-    """Return the adjoints of C and F (9 each) by the strain.
+    """Return the contributions of the strain to the adjoints of C and F (9 each).
 
     Args:
         c: C.
@@ -155,7 +156,7 @@ def series_of(real: ir.Type) -> algebra.Series:
 
 
 def in_series_range(one: Tile | Particle, j: Number, z_squared: Number) -> list[ir.Value]:
-    """Return where the series serve J and |Z|^2."""
+    """Return the conditions for J and |Z|^2 to be in the range of the series."""
     code = one.code
     above = code.below(z_squared.value, one.number("z_squared_max").value, equal=True)
     low = code.below(one.number("j_min").value, j.value, equal=True)
@@ -166,7 +167,7 @@ def in_series_range(one: Tile | Particle, j: Number, z_squared: Number) -> list[
 class Tile:
     """Entries of a tile in a thread's working area ``strains``, and lane vectors at other addresses.
 
-    Where bodies have different laws, only lanes whose law's number is ``own`` are written.
+    If bodies have different laws, only lanes with the law number ``own`` are written.
     """
 
     def __init__(
@@ -184,12 +185,12 @@ class Tile:
         return Number(self.code, self.code.splat(self.code.args[name], LANE))
 
     def take(self, first: int, count: int, name: str = "strains") -> list[Number]:
-        """Return lane vectors from an entry on."""
+        """Read consecutive lane vectors."""
         place = self.code.args[name]
         return [Number(self.code, self.code.lane_vector(place, first + k)) for k in range(count)]
 
     def leave(self, first: int, values: Sequence[Number | float], name: str = "strains") -> None:
-        """Write lane vectors from an entry on; outside ``strains`` in own lanes alone."""
+        """Write consecutive lane vectors; outside ``strains`` only in own lanes."""
         place = self.code.args[name]
         for k, one in enumerate(values):
             value = one.value if isinstance(one, Number) else self.code.constant(one)
@@ -204,7 +205,7 @@ class Tile:
         return self.code.all_of(*conditions)
 
     def strain(self) -> tuple[Any, ...]:
-        """Return C, G, J and the strain; whether the series serve all lanes is noted."""
+        """Return C, G, J and the strain; record whether all lanes are in the range of the series."""
         c, f = self.take(AT_C, 9, "source"), self.take(AT_F, 9, "source")
         g = algebra.trial_gradient(c, f, self.number("dt"))
         j = algebra.det(g)
@@ -216,7 +217,7 @@ class Tile:
         return self.take(STRAIN_PARAMETERS, 3)
 
     def note_yield(self, d: Sequence[Number], yield_strain: Number) -> None:
-        """Note whether any lane yields."""
+        """Record whether any lane yields."""
         _q, _det, _norm, k = von_mises.yield_factor(d, yield_strain)
         rigid = self.code.below(self.code.constant(1.0), k.value, equal=True)
         self.code.put("rigid", self.all_own(rigid))
@@ -233,7 +234,7 @@ def tile_strain(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> Non
 
 
 def tile_whole_strain(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """The same with what its adjoint needs."""
+    """As :func:`tile_strain`, with the intermediate results for the adjoint."""
     tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served", mixed)
     _c, g, j, (c2, w, z, _z2, a1, a2, d) = tile.strain()
     for first, values in ((0, g), (STRAIN_D, d), (STRAIN_W, w), (STRAIN_Z, z)):
@@ -302,7 +303,8 @@ def tile_rest_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) 
 
 
 def tile_strain_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoints of C and F of a tile to ``bar``, from those of d, of what else the stress takes, and of G."""
+    """Adjoints of C and F of a tile to ``bar``, from those of d, of the other inputs of the stress, and of
+    G."""
     tile = Tile(module, name, real, "source affine bar", "dt mass", mixed)
     c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
     g, w, z, d = (tile.take(at, n) for at, n in ((0, 9), (STRAIN_W, 6), (STRAIN_Z, 6), (STRAIN_D, 6)))
@@ -360,7 +362,7 @@ def tile_adjoint(law: Law, module: ir.Module, name: str, real: ir.Type, mixed: b
 
 
 def tile_makers(law: Law, mixed: bool) -> dict[str, Maker]:
-    """Return what writes a law's functions of tiles, by name."""
+    """Return the writers of a law's functions of tiles, by name."""
     makers: dict[str, Callable[..., None]] = {
         "update": partial(tile_update, law, True),
         "stress_only": partial(tile_update, law, False),
@@ -379,7 +381,7 @@ def _with_kind(maker: Callable[..., None], mixed: bool, module: ir.Module, name:
 
 
 class Particle:
-    """Numbers of a particle, which the function takes as the caller's local variables and leaves there."""
+    """Numbers of a particle, read from and written to local variables of the caller."""
 
     def __init__(
         self,
@@ -409,7 +411,7 @@ class Particle:
             self.code.put(f"{name}{k}", value)
 
     def strain(self, c: Sequence[Number], f: Sequence[Number]) -> tuple[Any, ...]:
-        """Return G, J, the strain and whether the series serve it, which is noted."""
+        """Return G, J, the strain and whether it is in the range of the series, which is also recorded."""
         g = algebra.trial_gradient(c, f, self.number("dt"))
         j = algebra.det(g)
         found = von_mises.hencky_strain(g, j, self.series)
@@ -424,11 +426,11 @@ class Particle:
 
 
 RANGE = "z_squared_max j_min j_max served"
-"""Range of the series, and whether they served."""
+"""Range of the series, and whether it applies."""
 
 
 def scheduled_particle(module: ir.Module, name: str, real: ir.Type) -> None:
-    """A in C's place, and F after the substep in F's; untouched where the series do not serve."""
+    """A in C's place, and F after the substep in F's; unchanged outside the range of the series."""
     one = Particle(module, name, real, "c9 f9 p3", f"{' '.join(CONSTANTS)} {RANGE}")
     code, c, f, (mu, lam, limit) = one.code, one.take("c"), one.take("f"), one.take("p")
     g, j, (c2, _w, _z, _z2, _a1, _a2, d), fits = one.strain(c, f)
@@ -492,7 +494,7 @@ def particle_adjoint(law: Law, module: ir.Module, name: str, real: ir.Type) -> N
 
 
 def particle_makers(law: Law) -> dict[str, Maker]:
-    """Return what writes a law's functions of particles, by name."""
+    """Return the writers of a law's functions of particles, by name."""
     if law is LAWS["von_mises"]:
         return {"particle": scheduled_particle, "particle_adjoint": scheduled_particle_adjoint}
     return {"particle": partial(particle, law), "particle_adjoint": partial(particle_adjoint, law)}

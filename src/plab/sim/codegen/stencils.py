@@ -1,8 +1,8 @@
 """Sums over a particle's 27 nodes, for LLVM.
 
-What Taichi emits for these sums looks up where fields begin after each store, takes a node at a time and
-never fuses a product with a sum. Here three nodes that are neighbours along z are one row of twelve numbers,
-in a vector of eight and one of four.
+Taichi's code for these sums reloads the addresses of fields after each store, processes one node at a time
+and never fuses products and sums. Here three neighbouring nodes along z form a row of twelve numbers, in a
+vector of eight and one of four.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Stencil(Code):
     def field(
         self, value: Sequence[ir.Value], columns: Sequence[Sequence[ir.Value]], scale: ir.Value
     ) -> list[Row]:
-        """The row of an affine field at the base node, and what is added to it along x and y: from the
-        field's value (4) there, and the columns (3) of a matrix, to be scaled."""
+        """Row of an affine field at the base node and its increments along x and y, from the field's value
+        (4) there and the columns (3) of a matrix times a scale."""
         base = self.vector(value)
         x, y, z = (self.mul(self.vector([*one, self.real(0.0)]), self.splat(scale, 4)) for one in columns)
         second = self.add(base, z)
