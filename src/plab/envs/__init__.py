@@ -16,7 +16,7 @@ from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS, suite_tasks
 __all__ = ["ENTRY_POINT", "make", "make_vec", "register_suite", "register_task"]
 
 ENTRY_POINT = "plab.envs.single:PlabEnv"
-"""Entry point of plab's environments in Gymnasium's registry."""
+"""Entry point of the environments in Gymnasium's registry."""
 
 
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:

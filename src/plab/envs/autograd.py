@@ -1,7 +1,7 @@
 """Simulator as functions that PyTorch differentiates.
 
-Trajectory losses, differentiable by the actions; states for losses of your own, differentiable by initial
-state and material, too; and the gradient of a policy that reacts to observations. With ``sim.device=cuda``
+Differentiable PyTorch functions of the simulator: trajectory losses of actions, states for custom losses,
+also with respect to initial state and material, and closed-loop policy gradients. With ``sim.device=cuda``
 tensors stay on the device.
 """
 
@@ -27,12 +27,13 @@ __all__ = ["PolicySteps", "States", "policy_gradient", "rollout", "simulate"]
 
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
-    """Run actions from the initial states and return the trajectory losses, differentiable by the actions.
+    """Simulate actions from the initial states and return the trajectory losses, differentiable with respect
+    to the actions.
 
     The contact model is the one that the problem's simulator is set to. The gradient is that of a sequence of
     actions: what else the actions depend on, such as observations, is outside it. Where an action lies beyond
-    [-1, 1], it is clipped and has no gradient. The gradient is computed together with the losses, where the
-    actions require one and PyTorch records gradients, and has no derivative of its own.
+    [-1, 1], it is clipped and has no gradient. The gradient is computed together with the losses if the
+    actions require gradients; second derivatives are not supported.
 
     Args:
         problem: Scenes, targets and simulator.
@@ -71,7 +72,7 @@ class _Rollout(torch.autograd.Function):
 
 
 def _given(tensor: torch.Tensor, simulator: Simulator) -> Any:
-    """Return a tensor as the simulator takes it: on its CUDA device as it is, else as an array."""
+    """Return a tensor as input for the simulator: unchanged on its CUDA device, otherwise as an array."""
     return tensor.detach() if tensor.is_cuda and simulator.device == "cuda" else _numbers(tensor)
 
 
@@ -86,7 +87,7 @@ class States(NamedTuple):
         x: Particle positions [domain units], shape [batch, T, particle, 3].
         v: Particle velocities, likewise.
         poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, T, manipulator, 8].
-        mass: Mass tensors, shape [batch, T, n, n, n]; empty if they were not asked for.
+        mass: Mass tensors, shape [batch, T, n, n, n]; empty if not requested.
     """
 
     x: torch.Tensor
@@ -119,8 +120,8 @@ def simulate(
             simulator's precision.
         every_step: Return the state after every environment step, not the last one alone.
         mass: Return mass tensors, too.
-        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] where
-            bodies have materials of their own; as they are if None.
+        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] if
+            bodies have their own materials; default: unchanged.
         **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. The simulator keeps
             them, as it does the material.
 
@@ -133,7 +134,7 @@ def simulate(
         plab.scenes.SceneError: If the material cannot be simulated.
         plab.sim.SimulationError: If state or gradient stop being finite.
         MemoryError: If the gradient does not fit the memory budget.
-        RuntimeError: If a gradient was asked for after the simulator has run again, or needs
+        RuntimeError: If a gradient is requested after the simulator has been used again, or requires
             ``full_gradient=True``.
     """
     if unknown := set(initial) - set(_FIELDS):
@@ -232,9 +233,9 @@ def policy_gradient(
     its parameters.
 
     The loss is the mean over the environments of the discounted step losses, less the discounted value of the
-    last observation. The gradient is the whole one: it goes through the simulated states, and through what
-    each action changes in later observations, and thereby in later actions. A policy may draw its actions, as
-    functions of noise (``rsample``).
+    last observation. The gradient is complete: it includes the simulated states and the effect of each action
+    on later observations, and thereby on later actions. A policy may draw its actions, as functions of noise
+    (``rsample``).
 
     Args:
         batch: Episodes that were :meth:`~plab.envs.core.EpisodeBatch.reset`; they advance.
@@ -242,7 +243,8 @@ def policy_gradient(
             [-1, 1]; on the simulator's device. Observations have the type of its parameters.
         steps: Steps T.
         parameters: Parameters of the policy; None: those of a module.
-        discount: The loss of step t weighs so much to the power of t, the value to the power of T.
+        discount: Discount factor: the loss of step t is weighted by ``discount ** t``, the value by
+            ``discount ** T``.
         value: Maps observations to values, shape [batch]; its parameters get no gradient.
 
     Returns:

@@ -1,7 +1,7 @@
 """Batch of episodes in one simulator, below the environments of all libraries.
 
-The environments for Gymnasium, Stable-Baselines3 and PyTorch are views of an :class:`EpisodeBatch` in the
-form that each library asks for, and add nothing of their own.
+The environments for Gymnasium, Stable-Baselines3 and PyTorch are thin adapters of an :class:`EpisodeBatch` to
+the interface of each library.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 _LOCK = threading.RLock()
-"""Held by whoever simulates: Taichi compiles and launches kernels for one thread at a time."""
+"""Held by the simulating thread: Taichi compiles and launches kernels for one thread at a time."""
 
 
 def _alone(method: _Method) -> _Method:
@@ -170,10 +170,10 @@ class Transition:
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         terminated: Whether episodes have ended in success, shape [batch], on the host.
         truncated: Whether episodes have reached the horizon, shape [batch], on the host.
-        info: The entries of ``info``, each of shape [batch], in type like the rewards; what was drawn is
-            under ``randomized``, by key, on the host.
-        failures: Environments that have broken off in the episode, with time and reason; their numbers are
-            those of the step before. Empty if the step was ``strict``.
+        info: Entries of ``info``, each of shape [batch] and of the type of the rewards; sampled parameters
+            are under ``randomized``, by key, on the host.
+        failures: Environments that have diverged in the episode, with time and reason; their values are those
+            of the previous step. Empty if the step was ``strict``.
     """
 
     observation: Array
@@ -203,12 +203,12 @@ class EpisodeState:
     Attributes:
         steps: Steps taken in the episodes, shape [batch]; None before the first :meth:`EpisodeBatch.reset`.
         simulation: Particles and manipulators, shape [batch, ...] each.
-        failures: Environments that have broken off.
-        last: Observations, loss terms, IoU and impulses, if they are asked for, of the last step.
+        failures: Diverged environments.
+        last: Observations, loss terms, IoU and, if requested, impulses of the last step.
         seeds: Entropy of the environments' draws.
         episodes: Numbers of the episodes, shape [batch].
         over: Which episodes have ended by a success or at the horizon, shape [batch].
-        values: What was drawn for each environment, by key.
+        values: Sampled parameters of each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
         stages: Numbers, earnings and scores of the stages; empty where there are none.
     """
@@ -233,7 +233,7 @@ class EpisodeBatch:
         contact: Contact model of the episodes, ``hard`` or ``soft``.
         size: Number of sub-environments.
         horizon: Steps of an episode.
-        draws: What the episodes draw.
+        draws: Randomisation of the episodes.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
         listener: Called with the actions and the result of each step; None if nothing listens.
@@ -263,8 +263,8 @@ class EpisodeBatch:
             observe: One of :data:`plab.envs.observations.OBSERVATIONS`; or several, which makes observations
                 a dictionary with keys such as ``state`` and ``front_depth``.
             cameras: Cameras by name, or their attributes; those of the task if None, or one named ``front``.
-            randomize: Ranges of what each episode draws, in place of the tasks' own, see
-                :mod:`plab.config.draws`; empty: nothing.
+            randomize: Ranges of randomised parameters, replacing those of the tasks, see
+                :mod:`plab.config.draws`; empty: none.
             impulses: Whether ``info`` has the impulses on the manipulators; so it has if they are observed.
             stages: Whether episodes ask for the targets of ``task.stages`` first; :func:`make_batch` sets it.
             success_score: Score from which on a state is a success.
@@ -277,7 +277,7 @@ class EpisodeBatch:
             plab.config.ConfigError: If the configurations do not fit together, or a range does not do.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
-            plab.sim.DeviceError: If CUDA was asked for and is not there.
+            plab.sim.DeviceError: If CUDA is not available.
             RuntimeError: If this process was forked from one that has made environments.
         """
         if contact not in CONTACTS:
@@ -309,7 +309,7 @@ class EpisodeBatch:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
 
         Raises:
-            ValueError: If they are not as many, or observations would hold other things.
+            ValueError: If their number or the entries of observations differ.
             plab.config.ConfigError: If the configurations do not fit together.
             plab.scenes.SceneError: If a scene cannot be simulated or is of another kind.
             plab.targets.TargetError: If a target cannot be built.
@@ -356,7 +356,7 @@ class EpisodeBatch:
             self._observer = Observer(self.problem, self.configs[0])
         self._steps: np.ndarray | None = None
         self._over = np.zeros(self.size, bool)
-        # Of environments with the same configuration, each has draws of its own.
+        # Environments with the same configuration have independent samples.
         ids = [id(cfg) for cfg in self.configs]
         self._seeds: list[tuple[int, ...]] = [
             (cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)
@@ -369,7 +369,7 @@ class EpisodeBatch:
         """Measure and observe the initial states of all environments, in which they are."""
         self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
-        # Observations and measures of the last step, which environments that break off keep.
+        # Observations and measures of the last step, kept for diverged environments.
         self._initial = self._last = self._seen()
         self._initial_loss = Constants(self.problem.loss_of(self._initial[1]))
 
@@ -410,10 +410,10 @@ class EpisodeBatch:
         Args:
             like: Given a CUDA tensor, everything returned is one too.
             environments: Numbers of those that start an episode; all if None.
-            seeds: Seed of each of these, from which its draws begin anew; if None they go on.
-            episode: Number of the episodes, of which the draws depend; the next if None.
-            options: Values by dotted key of the task in place of what is drawn, for all of these or, with a
-                first axis of the batch's length, one for each.
+            seeds: Seeds of these environments, which restart their random sequences; default: continue.
+            episode: Number of the episodes, which determines the samples; default: the next.
+            options: Values by dotted key of the task that replace samples, for all of these or, with a first
+                axis of the batch's length, one for each.
 
         Returns:
             Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch]; of
@@ -453,7 +453,7 @@ class EpisodeBatch:
         else:
             self._last = self._initial
         self._keep(before, [e for e in range(self.size) if e not in rows])
-        # Copies: a caller may keep and change what it is given.
+        # Copies, because callers may keep and modify them.
         observation, *measured = self._last = _copies(self._last)
         return mapped(_copy, observation), self._info(*measured)
 
@@ -475,7 +475,7 @@ class EpisodeBatch:
                 mapped(lambda now, then: _restore_rows(now, then, rows), table, old)
 
     def require_running(self, idle: np.ndarray | None = None) -> None:
-        """Raise ResetNeeded if an episode has ended, also by breaking off, except ``idle`` ones."""
+        """Raise ResetNeeded if an episode has ended, also by divergence, except ``idle`` ones."""
         if np.any(self.over if idle is None else self.over & ~idle):
             raise ResetNeeded("the episode is over: call reset() before step()")
 
@@ -484,11 +484,11 @@ class EpisodeBatch:
         """Advance all sub-environments by one step.
 
         Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes back
-                are tensors on the same device, and no array crosses to the host.
-            strict: Whether a sub-environment that breaks off is an error. Otherwise, the same for all steps
-                of an episode, it is an entry in ``failures`` and keeps its last numbers while the others go
-                on; :meth:`reset` restores it.
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. For a CUDA tensor, results are
+                tensors on the same device, without copies to the host.
+            strict: Whether divergence of a sub-environment is an error. Otherwise, the same for all steps of
+                an episode, it is an entry in ``failures`` and keeps its last numbers while the others go on;
+                :meth:`reset` restores it.
             idle: Which sub-environments are over and about to be reset, shape [batch]; their numbers mean
                 nothing.
 
@@ -562,7 +562,7 @@ class EpisodeBatch:
         """
         simulation = self._simulator.state()
         for e in self._failures:
-            # What has broken off rests: any state that is finite will do.
+            # Diverged environments are frozen in an arbitrary finite state.
             simulation.x[e], simulation.v[e], simulation.C[e], simulation.F[e] = 0.5, 0.0, 0.0, np.eye(3)
         starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
         return EpisodeState(
@@ -615,19 +615,20 @@ class EpisodeBatch:
         discount: float = 1.0,
         like: torch.Tensor | None = None,
     ) -> Array:
-        """Advance all sub-environments by some steps whose actions are chosen from observations, and go back
-        through the states and through what chose the actions.
+        """Advance all sub-environments by some steps with actions chosen from observations, and backpropagate
+        through the states and the policy.
 
         Observations are float64; CUDA tensors have the type of ``like``.
 
         Args:
-            steps: Steps T, at most those that are left of the episodes.
-            choose: Called with t = 0 to T and observations, shape [batch, entry]; returns the actions of step
-                t, shape [batch, action]; what it returns for T is ignored.
-            react: Called with t = T to 0 and the derivative of the discounted loss by the actions of step t,
-                None for T; returns the derivative by the observation before step t through these actions
-                (for T: of a function of the last observation), or None.
-            discount: The loss of step t weighs so much to the power of t.
+            steps: Number of steps T, at most the remaining steps of the episodes.
+            choose: Policy, called with t = 0 to T and observations, shape [batch, entry]. Returns the actions
+                of step t, shape [batch, action]; the result for T is ignored.
+            react: Pullback of the policy, called with t = T to 0 and the derivative of the discounted loss
+                with respect to the actions of step t, None for T. Returns the derivative with respect to the
+                observation before step t through these actions (for T: of a function of the last
+                observation), or None.
+            discount: Discount factor: the loss of step t is weighted by ``discount ** t``.
             like: Given a CUDA tensor, everything is one too.
 
         Returns:
@@ -718,7 +719,7 @@ class EpisodeBatch:
         return self._observe(like), *measured
 
     def _measured(self, like: Array = None) -> tuple[Array, ...]:
-        """Return loss terms, IoU and, if they are asked for, impulses of the current states."""
+        """Return loss terms, IoU and, if requested, impulses of the current states."""
         measures = self._simulator.measure(like)
         impulses = (self._simulator.impulses(like),) if self._sums_impulses else ()
         return measures.terms, measures.iou, *impulses
@@ -760,7 +761,7 @@ class Restorable:
         }
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        """Build the environment anew, and put it into the state."""
+        """Rebuild the environment, and restore the state."""
         self.__init__(**kept["arguments"])  # type: ignore[misc]
         self.batch.set_state(kept["state"])
         self._is_seeded = True
@@ -783,7 +784,7 @@ class Restorable:
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
-    """Refuse configurations whose observations hold different entries."""
+    """Raise ConfigError for configurations with different entries of observations."""
     for key in OBSERVATION_KEYS:
         if len({getattr(cfg, key) for cfg in cfgs}) > 1:
             raise ArgumentError(f"{key} differs between sub-environments: they share one space")
@@ -810,7 +811,7 @@ def _on_host(table: Array) -> np.ndarray:
 
 
 def info_of(transition_info: Mapping[str, Any], e: int, failures: Mapping[int, str]) -> dict[str, Any]:
-    """Return the ``info`` of one sub-environment, with ``failure``, the reason, if it has broken off."""
+    """Return the ``info`` of one sub-environment, with the reason as ``failure`` if it has diverged."""
 
     def one(values: np.ndarray) -> Any:
         return values[e].item() if values.ndim == 1 else values[e]

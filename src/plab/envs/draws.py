@@ -1,7 +1,7 @@
-"""Draws of episodes: scenes, starts, targets and noise that differ from reset to reset.
+"""Domain randomisation: scenes, initial states, targets and noise sampled at every reset.
 
-Everything drawn is data of the simulator: nothing is compiled anew. What an episode draws depends on the
-environment's seed and the number of the episode alone, not on the batch or the device.
+All sampled parameters are data of the simulator, so nothing is recompiled. Samples depend only on the
+environment's seed and the number of the episode, not on the batch or the device.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ class _Base:
 
 
 class EpisodeRandomizer:
-    """Draws of the sub-environments of a batch.
+    """Randomisation of the sub-environments of a batch.
 
     Attributes:
-        values: What each sub-environment has in its episode, by dotted key; empty where it is as configured.
-        scenes: Scenes with all lowest and all highest values, which bound the observations.
+        values: Sampled values of each sub-environment, by dotted key; empty without randomisation.
+        scenes: Scenes with the lowest and the highest values, which determine the bounds of observations.
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
@@ -111,8 +111,8 @@ class EpisodeRandomizer:
         return np.array([float(values.get(NOISE, 0.0)) for values in self.values])
 
     def info(self) -> dict[str, np.ndarray]:
-        """Return what was drawn, by dotted key, each of shape [batch, ...]; NaN where a sub-environment is as
-        configured."""
+        """Return the sampled values by dotted key, each of shape [batch, ...]; NaN where a sub-environment is
+        as configured."""
         known = {key: value for values in self.values for key, value in values.items()}
         return {
             key: np.array([values.get(key, np.full(np.shape(like), np.nan)) for values in self.values])
@@ -122,12 +122,12 @@ class EpisodeRandomizer:
     def randomize_episodes(
         self, environments: Sequence[int], seeds: Sequence[Sequence[int]], given: Mapping[str, Any]
     ) -> bool:
-        """Draw the next episodes of some sub-environments, and change the simulator's scenes and targets.
+        """Sample the next episodes of some sub-environments, and update the simulator's scenes and targets.
 
         Args:
             environments: Their numbers.
-            seeds: Entropy of each of them.
-            given: Values by dotted key that are not drawn, for all or one per sub-environment of the batch.
+            seeds: Entropy of each sub-environment.
+            given: Values by dotted key that replace samples, for all or one per sub-environment of the batch.
 
         Returns:
             Whether anything differs from the episodes before.
@@ -192,7 +192,7 @@ class EpisodeRandomizer:
 
     @staticmethod
     def _checked(cfg: Config) -> Scene:
-        """Return the scene of a configuration whose values may be out of range."""
+        """Return the scene of a configuration, whose values may be out of range."""
         cfg.task.check("task")
         return build_scene(cfg)
 
@@ -216,7 +216,7 @@ def _places(scene: Scene) -> list[Any]:
 
 
 def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np.ndarray:
-    """Return the particles of a scene whose bodies are where they are to be, shape [particle, 3]."""
+    """Return the particle positions of a scene with its bodies at the sampled poses, shape [particle, 3]."""
     x, bodies = base.sample().copy(), base.scene.particle_bodies
     for number, (name, body) in enumerate(zip(base.cfg.task.bodies, base.scene.bodies, strict=True)):
         own, center = bodies == number, np.array(places[number][0])
@@ -231,7 +231,7 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
     """Make the scenes and targets that a configuration's episodes draw from."""
     count = int(cfg.task.randomize[SCENES])
     drawn = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
-    # Building them says what is wrong with all of them.
+    # Errors of these scenes are raised when they are built.
     drawn = [one for one in drawn if fits(one)] or drawn
     pool: list[_Base] = []
     own, size = simulator.scenes, simulator.batch

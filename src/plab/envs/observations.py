@@ -22,7 +22,7 @@ __all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "sp
 PICTURES = ("depth", "rgb", "segmentation")
 
 OBSERVATIONS = ("state", "particles", "points", "mass", "target_mass", "target_points", "impulses", *PICTURES)
-"""Names of what can be observed."""
+"""Names of observations."""
 
 CELLS = 16
 """Cells per axis of ``mass`` and ``target_mass``."""
@@ -38,7 +38,7 @@ class Observer:
     """Observations of the environments of a batch.
 
     Attributes:
-        stride: Every so many-th particle is observed.
+        stride: Stride between observed particles.
         constant: Last entries of an observation that do not change in an episode.
     """
 
@@ -73,14 +73,15 @@ class Observer:
 class SurfacePoints:
     """Particles at the surface of bodies.
 
-    Those have an empty cell beside theirs, in a coarse grid of which every cell inside a body holds some.
+    Surface particles have an empty neighbouring cell in a grid coarse enough that no cell inside a body is
+    empty.
     """
 
     CELL = 2.5
     """Edge of a cell [mean particle spacings]."""
 
     def __init__(self, simulator: Simulator, count: int) -> None:
-        """Take over a simulator, whose states are observed, and the number of points."""
+        """Initialise with the observed simulator and the number of points."""
         self._simulator, self._count = simulator, count
         body = simulator.scenes[0].bodies[0]
         self._spacing = (body.volume / body.particles) ** (1 / 3)
@@ -132,7 +133,7 @@ class Sensors:
     """Observations by key: of the state, of particles, and pictures of cameras.
 
     Attributes:
-        names: What is observed, of :data:`OBSERVATIONS`.
+        names: Names of the observations, out of :data:`OBSERVATIONS`.
         space: Space of one environment's observation: that of the state or of a picture alone, or a Dict.
     """
 
@@ -144,7 +145,7 @@ class Sensors:
         state_space: Box,
         points: int,
     ) -> None:
-        """Choose what is observed.
+        """Select the observations.
 
         Args:
             observe: One of :data:`OBSERVATIONS`, or several.
@@ -229,7 +230,7 @@ class Sensors:
         return next(iter(out.values())) if self._alone else out
 
     def _target_observations(self) -> dict[str, Constants]:
-        """Return what is observed of the targets, made anew when they change."""
+        """Return the observations of the targets, updated when these change."""
         names = {"target_mass", "target_points"} & set(self.names)
         masses: Any = cast(Simulator, self._simulator).target_mass if names else self._known_target
         if masses is not self._known_target:
@@ -329,7 +330,7 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
     """Return the indices of the entries that are positions along x and along z, shape [2, position]: of the
     observed particles, of the manipulators and, if it is observed, of the target."""
     particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
-    # Of the mass that has to leave, then of that which has to arrive: share, centroid (3), deviations (3).
+    # Excess mass, then missing mass: fraction, centroid (3) and standard deviations (3) of each.
     centroids = [1, 8] if cfg.observe_target else []
     along_x = [
         *range(0, particles, 6),

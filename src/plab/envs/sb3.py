@@ -27,12 +27,12 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
         env_id: Such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
         render_mode: ``rgb_array``, or None for no pictures.
-        **options: Arguments of :func:`plab.envs.core.make_batch` and :class:`plab.envs.core.EpisodeBatch`. If
-            several things are observed, the policy has to take dictionaries, as ``MultiInputPolicy`` does.
+        **options: Arguments of :func:`plab.envs.core.make_batch` and :class:`plab.envs.core.EpisodeBatch`.
+            With several observations, the policy must accept dictionaries, such as ``MultiInputPolicy``.
 
     Raises:
         gymnasium.error.Error: If there is no such id.
-        ValueError: If an argument does not fit, or the id is not one of plab's; see also
+        ValueError: If an argument is invalid, or the id is not one of plab's; see also
             :class:`plab.envs.core.EpisodeBatch`.
     """
     spec = gymnasium.spec(env_id)
@@ -49,9 +49,9 @@ class PlabVecEnv(VecEnv):
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
-        spec: Gymnasium's specification of one sub-environment, if there is one.
-        together: Whether all episodes end together: one that breaks off rests until then, with the reason
-            under ``failure`` in its infos; otherwise it is truncated and reset at once.
+        spec: Gymnasium's specification of one sub-environment, if any.
+        together: Whether all episodes end together: a diverged episode is then frozen until the end, with the
+            reason as ``failure`` in its infos. Otherwise it is truncated and reset immediately.
         next_episode: Number of the episodes that the next :meth:`reset` starts; that after the last if None.
     """
 
@@ -154,7 +154,7 @@ class PlabVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refuse: there are no objects whose method could be called.
+        """Raise an error, because there are no separate environment objects.
 
         Raises:
             AttributeError: Always.

@@ -20,8 +20,8 @@ __all__ = ["PlabEnv"]
 class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     """A task as a Gymnasium environment.
 
-    An episode is truncated after ``sim.horizon`` steps, or where the simulation breaks off, with the reason
-    in ``info["failure"]``. Every start is the same, unless the task says what to draw.
+    An episode is truncated after ``sim.horizon`` steps, or if the simulation diverges, with the reason in
+    ``info["failure"]``. Every episode starts from the same state, unless the task has randomised parameters.
 
     Attributes:
         batch: The episode, a batch of one, with its scene, target and simulator.
@@ -71,8 +71,8 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
         """Start an episode.
 
         Args:
-            seed: Seed of ``np_random`` and of what this episode and the next ones draw.
-            options: Values by dotted key of the task in place of what is drawn, for this episode.
+            seed: Seed of ``np_random`` and of the randomisation of this episode and the next ones.
+            options: Values by dotted key of the task that replace samples in this episode.
 
         Returns:
             Observation, shape [entry], float32, or by key, and ``info``.

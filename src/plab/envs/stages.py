@@ -26,7 +26,7 @@ def staged(cfg: Config) -> bool:
 
 
 class Stages:
-    """Stages of the sub-environments of a batch, the last of which has the task's own target.
+    """Stages of the sub-environments of a batch; the last stage has the task's own target.
 
     Attributes:
         current: Number of each sub-environment's stage, shape [batch].
@@ -79,7 +79,7 @@ class Stages:
         return self.current.copy(), self.earned.copy(), self.scores.copy()
 
     def restore(self, saved: tuple[np.ndarray, ...], problem: Problem) -> None:
-        """Replace what changes in an episode."""
+        """Restore the state of the current episode."""
         current, self.earned, self.scores = (part.copy() for part in saved)
         self.enter(current, problem)
 

@@ -15,7 +15,7 @@ __all__ = ["TensorEnv", "floating"]
 
 
 def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
-    """Return actions as floating-point numbers: integers in the simulator's precision, others as they are.
+    """Return actions as floating-point numbers: integers are converted to the simulator's precision.
 
     Raises:
         TypeError: If they are complex.
@@ -53,12 +53,12 @@ class TensorEnv:
 
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1].
-            strict: Whether an environment that breaks off is an error; see
+            strict: Whether divergence of an environment is an error; see
                 :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
             Tensors; observations are float32, the others have the type of the actions, or the simulator's
-            precision if those are integers. ``terminated``, ``truncated`` and what was drawn are arrays.
+            precision if those are integers. ``terminated``, ``truncated`` and sampled parameters are arrays.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.

@@ -22,8 +22,8 @@ __all__ = ["PlabVectorEnv"]
 class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     """Sub-environments that one simulator advances together.
 
-    Episodes end as those of :class:`plab.envs.single.PlabEnv` do, each for itself. What happens then is up to
-    ``metadata["autoreset_mode"]``.
+    Episodes end as those of :class:`plab.envs.single.PlabEnv` do, each for itself.
+    ``metadata["autoreset_mode"]`` determines when they are reset.
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
@@ -51,8 +51,8 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             variant: Name of its variant.
             render_mode: ``rgb_array``, or None for no pictures.
             autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``SameStep`` resets in the
-                step that ends an episode, whose last observation is in ``infos["final_obs"]``; ``NextStep``
-                in the next step, which ignores the action; ``Disabled`` leaves it to :meth:`reset` with
+                last step of an episode, with the final observation in ``infos["final_obs"]``; ``NextStep`` in
+                the next step, which ignores the action; ``Disabled`` leaves it to :meth:`reset` with
                 ``options={"reset_mask": ...}``.
             **options: Arguments of :func:`plab.envs.core.make_batch` and
                 :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and
@@ -83,10 +83,10 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Start episodes of the sub-environments.
 
         Args:
-            seed: Seed of ``np_random`` and of what this episode and the next ones draw: sub-environment i has
-                ``seed + i``, or its own of a list.
-            options: Values by dotted key of the task in place of what is drawn, for all or one per
-                sub-environment; and ``reset_mask``, shape [env]: those that start an episode.
+            seed: Seed of ``np_random`` and of the randomisation of this episode and the next ones:
+                sub-environment i uses ``seed + i``, or its entry of a list.
+            options: Values by dotted key of the task that replace samples, for all or one per
+                sub-environment; and ``reset_mask``, shape [env]: sub-environments to reset.
 
         Returns:
             Observations, shape [env, entry], float32, or by key, and ``info``.
@@ -170,7 +170,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         return {"failure": texts} if failures else {}
 
     def _masked(self, info: Mapping[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Add Gymnasium's masks, which say which sub-environments have an entry; others have 0."""
+        """Add Gymnasium's masks of the sub-environments that have an entry; the others have 0."""
         out: dict[str, Any] = {}
         for name, values in info.items():
             own = np.ones(self.num_envs, bool) if mask is None else mask.copy()

@@ -16,7 +16,7 @@ LAWS = {law.name: law for law in (VON_MISES, ELASTIC, DRUCKER_PRAGER, FLUID, VIS
 
 
 def find_law(name: str) -> Law:
-    """Return a law of plab's by its name, or one of a file outside plab by ``module:NAME``.
+    """Return a law by its name, or by ``module:NAME`` for a law outside plab.
 
     Raises:
         plab.config.ConfigError: If there is none; one line.

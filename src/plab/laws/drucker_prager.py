@@ -1,8 +1,8 @@
 """Sand: Hencky elasticity with Drucker-Prager plasticity (Klar et al., 2016).
 
-With the principal Hencky strains e of the trial state, their trace and deviator, sand carries shear up to a
-multiple of its pressure: the deviator is scaled to at most ``-alpha (3 lambda + 2 mu) / (2 mu) tr e``, at
-constant volume. Where the trace is positive nothing is carried.
+Sand carries shear up to a multiple of its pressure: with the principal Hencky strains e of the trial state,
+the norm of the deviator is limited to ``-alpha (3 lambda + 2 mu) / (2 mu) tr e``, at constant volume. Where
+the trace is positive nothing is carried.
 
 F keeps the volume by which separated sand has expanded, so that it carries pressure again only once it is
 back at its volume: the volume correction of Tampubolon et al. (2017).
@@ -21,7 +21,7 @@ SQUARE_MIN = 0.0025
 """Squares of stretches are clamped from below before the logarithm."""
 
 NORM_SHIFT = 1e-16
-"""Added to the square of the deviator's norm under the root, whose derivative at 0 would be infinite."""
+"""Added to the squared norm of the deviator, because the derivative of the root is infinite at 0."""
 
 
 def hencky(frame):

@@ -21,7 +21,7 @@ class Parameter:
         default: Value where none is given.
         interval: Admissible values, such as ``(0, inf)`` or ``[0, 0.5)``.
         unit: Unit; empty for a number.
-        meaning: What it is, in a few words.
+        meaning: Short description.
     """
 
     name: str
@@ -41,10 +41,10 @@ class Parameter:
 class Law:
     """A constitutive law of isotropic bodies of density 1.
 
-    Its functions are plain Python on components of any kind: numbers, NumPy's arrays, or what writes the
-    instructions of the simulator and records them for the adjoint. They may use ``+ - * /``, comparisons by
-    ``<`` and ``>``, and NumPy's ``sqrt, exp, log, minimum, maximum, where``. Full matrices have 9 components
-    in row-major order, symmetric ones 6: (00, 11, 22, 01, 02, 12).
+    Its functions are plain Python on numbers, NumPy arrays, or the tracers that generate the simulator's code
+    and record it for the adjoint. They may use ``+ - * /``, comparisons by ``<`` and ``>``, and NumPy's
+    ``sqrt, exp, log, minimum, maximum, where``. Full matrices have 9 components in row-major order, symmetric
+    ones 6: (00, 11, 22, 01, 02, 12).
 
     Attributes:
         name: Name in a task's YAML.
@@ -52,7 +52,7 @@ class Law:
         update: From C (9), F (9), the time step and the coefficients to the Kirchhoff stress (6) and F after
             the substep (9).
         stiffness: From the coefficients to 3 lambda + 2 mu at rest [pressure].
-        coefficients: From the parameters to what ``update`` takes of them; the parameters by default.
+        coefficients: Function that converts the parameters to coefficients of ``update``; default: identity.
         viscosity: From the coefficients to the largest dynamic viscosity [pressure x s].
     """
 
@@ -97,7 +97,7 @@ class Law:
         return dx * dx / (2.0 * viscosity + math.sqrt(4.0 * viscosity**2 + stiffness * dx * dx))
 
     def parameter_gradient(self, values: Mapping[str, float], bars: Sequence[float]) -> list[float]:
-        """Return derivatives by the parameters from those by the coefficients."""
+        """Convert derivatives with respect to coefficients to derivatives with respect to parameters."""
         trace = Trace()
         inputs = trace.inputs("values", len(self.parameters))
         own = derivatives(self.coefficients(*inputs), list(bars), inputs)

@@ -1,8 +1,8 @@
 """Principal stretches: eigenvalues and directions of b = G G^T, and symmetric tensors of the same directions.
 
 Jacobi's method with a fixed number of sweeps and no branches. The derivative is that of an isotropic tensor
-function: eigenvalues are differentiated in fixed directions, and what turns the directions enters by divided
-differences, with their limits where two eigenvalues meet. Nothing is clamped.
+function: eigenvalues in fixed directions, and rotations of the directions by divided differences, with their
+    limits for equal eigenvalues. Nothing is clamped.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ SWEEPS = 5
 """Sweeps over the three pairs of axes; four reach rounding in float32, five in float64."""
 
 TINY = 1e-30
-"""Keeps the tangent of a rotation at 0 where there is nothing to rotate."""
+"""Regularisation, so that the tangent of a rotation is 0 for diagonal tensors."""
 
 CLOSE = 3e-4
 """Relative distance of two eigenvalues below which a divided difference is taken at its limit."""
@@ -61,7 +61,7 @@ class PrincipalFrame:
         return total(x * y for x, y in zip(self._axes[i], row, strict=True))
 
     def tensor(self, principal):
-        """Return the symmetric tensor (6) of these directions whose principal values are given.
+        """Return the symmetric tensor (6) with these principal directions and the given principal values.
 
         They have to be the same function of the eigenvalues for each direction.
         """

@@ -4,7 +4,7 @@ A function that is called with the numbers of a :class:`Trace` records a node pe
 :func:`derivatives` walks the record backwards and adds the nodes of the adjoints; :func:`evaluated` computes
 nodes with numbers of any kind: NumPy's arrays, or :class:`plab.sim.codegen.llvm.Number`, which writes LLVM's
 instructions.
-Equal nodes are recorded once, and what no output needs is not computed.
+Equal nodes are recorded once, and unused nodes are not computed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Number = Any
 
 @dataclass(frozen=True)
 class Primitive:
-    """A function of one number with a derivative of its own, such as an iteration.
+    """A function of one number with an explicit derivative, such as an iteration.
 
     Attributes:
         function: The function.
@@ -75,7 +75,7 @@ class Node:
         return self.trace.node("less", other, self)
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
-        """Record a NumPy function of numbers, or an operator whose left side is a NumPy number."""
+        """Record a NumPy function of numbers, or an operator with a NumPy number on the left."""
         if function in _OPERATORS:
             left, right = given
             return _OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
@@ -104,7 +104,7 @@ _OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
 
 
 def frozen(number: Number) -> Number:
-    """Return a number whose derivative counts as zero."""
+    """Return a number that is treated as constant in derivatives."""
     return number.trace.node("frozen", number) if isinstance(number, Node) else number
 
 
@@ -116,7 +116,7 @@ class Trace:
         self._known: dict[tuple[Any, ...], Node] = {}
 
     def inputs(self, name: str, count: int) -> list[Node]:
-        """Return new inputs; ``name`` tells them from others."""
+        """Return new inputs; ``name`` distinguishes them from others."""
         return [self.node("input", f"{name}{k}") for k in range(count)]
 
     def node(self, operation: str | Primitive, *arguments: Number) -> Node:
@@ -166,7 +166,7 @@ def _negated(one: Number) -> bool:
 
 
 def _shares(node: Node, bar: Number) -> Sequence[Number]:
-    """Return what a node's adjoint adds to those of its arguments."""
+    """Return the contributions of a node's adjoint to the adjoints of its arguments."""
     a, *rest = node.arguments
     where = node.trace.node
     if isinstance(node.operation, Primitive):
@@ -204,9 +204,9 @@ def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Seque
     """Return the adjoints of some nodes from those of outputs.
 
     Args:
-        outputs: What was computed.
+        outputs: Outputs of the trace.
         bars: Adjoint of each output.
-        inputs: Nodes whose adjoints are asked for; they count as independent of each other.
+        inputs: Nodes whose adjoints are requested, treated as independent variables.
     """
     trace = inputs[0].trace
     varied = {one.place for one in inputs}

@@ -20,7 +20,7 @@ NEWTON_STEPS = 6
 FLOW_MIN = 1e-30
 
 LEAST = 1e-12
-"""Smallest share of the overstress that is raised to a power."""
+"""Lower bound of the relative overstress that is raised to a power."""
 
 
 def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
@@ -39,13 +39,13 @@ def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
 def overstress(trial, dt, mu, consistency, power):
     """Overstress x after the substep from the trial one.
 
-    It solves x + sqrt(2) mu dt (x / (sqrt(2) consistency))^power = trial, by Newton's method in x / trial, of
-    which the last step has the derivative.
+    It solves x + sqrt(2) mu dt (x / (sqrt(2) consistency))^power = trial, by Newton's method in x / trial.
+    The derivative is taken at the last step.
     """
     scale = np.maximum(trial, LEAST)
     ratio = scale / (math.sqrt(2.0) * consistency)
     flow = math.sqrt(2.0) * mu * dt * np.exp(power * np.log(ratio)) / scale
-    # Not below the solution, where both terms are at most 1.
+    # An upper bound of the solution, at which both terms are at most 1.
     x = np.exp(np.minimum(np.log(np.maximum(frozen(flow), FLOW_MIN)) * (-1.0 / frozen(power)), 0.0))
     for step in range(NEWTON_STEPS):
         last = step == NEWTON_STEPS - 1
@@ -57,7 +57,7 @@ def overstress(trial, dt, mu, consistency, power):
 
 
 def coefficients(youngs_modulus, poisson_ratio, yield_stress, consistency, exponent):
-    """Lame's parameters, and the others as they are."""
+    """Lame's parameters, and the other parameters unchanged."""
     return *lame(youngs_modulus, poisson_ratio), yield_stress, consistency, exponent
 
 

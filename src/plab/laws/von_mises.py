@@ -4,7 +4,7 @@ With the trial deformation gradient ``G = (I + dt C) F``, ``J = det G`` and the 
 tensor ``b = J^(-2/3) G G^T``, the deviatoric Hencky strain is ``d = log(b) / 2``. von Mises return mapping
 scales it by ``k = min(1, (yield / 2 mu) / |d|)``; so ``F' = exp((k - 1) d) G`` and the Kirchhoff stress of
 the fixed-corotated model is ``tau = 2 mu (V^2 - V) + lambda J (J - 1) I`` with ``V = J^(1/3) exp(k d)``.
-That is what an SVD of G would give.
+The result equals that of an SVD of G.
 
 Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
 rounding: :mod:`plab.laws.algebra` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
@@ -14,8 +14,8 @@ rounding: :mod:`plab.laws.algebra` has the coefficients of the polynomials in ``
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
 parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.laws.algebra.Series`.
 
-The update comes in parts, so that what a scene or a tile does not need is not computed;
-:mod:`plab.sim.codegen.materials` has their schedule, and :mod:`plab.sim.spectral` what is beyond the series.
+The update is divided into parts, so that unnecessary parts can be skipped; :mod:`plab.sim.codegen.materials`
+has their schedule, and :mod:`plab.sim.spectral` the update for strains outside the range of the series.
 """
 
 from dataclasses import replace

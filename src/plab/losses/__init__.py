@@ -21,12 +21,12 @@ __all__ = ["TERMS", "check_gradient", "make_terms"]
 
 
 def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> tuple[Term, ...]:
-    """Make the terms of a loss, and the overlap with the target, which scores are made of.
+    """Create the terms of a loss, and the overlap with the target for scores.
 
     Args:
         weights: Weight of each term by its name, each at least 0; a term of weight 0 is left out.
-        choices: Terms by the names of their weights, where these differ: a name of :data:`TERMS`, or a class
-            of your own as ``module:Class``.
+        choices: Implementations by name of the weight, if they differ from it: a name of :data:`TERMS`, or
+            ``module:Class`` of a custom class.
 
     Returns:
         New terms, for one simulator.
@@ -52,7 +52,7 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs Taichi when it is asked for."""
+    """Import attributes that need Taichi on first access."""
     if name == "check_gradient":
         from plab.losses.checking import check_gradient
 

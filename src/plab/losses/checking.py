@@ -18,7 +18,7 @@ STEP = 1e-6
 """Half the step of a central difference, along directions of unit variance."""
 
 DISTURBANCE = 0.02
-"""Standard deviation of the manipulators' displacements from their places in the scene [domain units]."""
+"""Standard deviation of the random displacements of manipulators [domain units]."""
 
 
 def check_gradient(
@@ -38,9 +38,9 @@ def check_gradient(
         seed: Seed of all that is random.
 
     Returns:
-        Largest error by part of the state: positions ``x``, velocities ``v`` and ``poses``, of these what can
-        change in a simulation. Relative to the largest derivative along a direction; 0 where the term does
-        not depend on the part.
+        Largest error by part of the state: positions ``x``, velocities ``v``, and the variable components of
+        ``poses``. Relative to the largest derivative along a direction; 0 where the term does not depend on
+        the part.
 
     Raises:
         ValueError: If the measure does not depend on the state at all: there is nothing to check.

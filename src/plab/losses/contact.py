@@ -13,7 +13,7 @@ from plab.sim.compiler import ti
 __all__ = ["AllContact", "NearestContact", "SoftContact"]
 
 FAR = 1e9
-"""Distance of the nearest particle before any was looked at [domain units]."""
+"""Initial value for the distance of the nearest particle [domain units]."""
 
 SHARPNESS = 1e4
 """Decay of the soft minimum's weights with the squared distance [1 / domain units^2], as in the PlasticineLab

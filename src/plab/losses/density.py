@@ -22,7 +22,7 @@ class Density(NodeTerm):
         self.total = sim.share(ti.field(ti.f64, shape=sim.batch))
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Sum the targets' masses: what empty environments miss."""
+        """Sum the targets' masses, the measure of an empty grid."""
         # A target of the release may have negative ones.
         self.sim.write(self.total, np.abs(mass).sum(axis=(1, 2, 3)))
 

@@ -13,7 +13,7 @@ __all__ = ["DistanceTerm", "NodeTerm", "ParticleTerm", "Term"]
 
 
 class Term:
-    """A term of the loss; the kinds below say which functions it has.
+    """Base class of loss terms; the subclasses below define the functions of each kind.
 
     Attributes:
         name: Name of its weight; ``loss_<name>`` is its column in results and its entry in ``info``.
@@ -83,19 +83,19 @@ class ParticleTerm(Term):
 
     @ti.func
     def finish(self, e):
-        """Return what environment ``e`` adds when all its particles are measured, float64."""
+        """Return the additional contribution of environment ``e``, float64."""
         return ti.cast(0.0, ti.f64)
 
 
 class DistanceTerm(Term):
     """A sum over the moving manipulators, of a function of their signed distances from all particles.
 
-    What is kept of a manipulator's distances while particles are looked at one after the other is a pair of
-    float64, the tally; tallies of parts of the particles are joined.
+    The distances of a manipulator are accumulated in a pair of float64, the tally; tallies of groups of
+    particles are joined.
 
     Attributes:
-        nearest_only: The derivative by a distance is 0 for all particles but one, whose number is the
-            tally's second entry.
+        nearest_only: The derivative with respect to a distance is nonzero for one particle only, whose number
+            is the second entry of the tally.
     """
 
     nearest_only: bool = False

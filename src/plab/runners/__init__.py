@@ -46,7 +46,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
 
     Raises:
         ResultsError: If the results folder cannot be written, or another process computes the run.
-        RunError: If the run broke off; what it computed is kept in the partial file.
+        RunError: If the run failed; its results so far are kept in the partial file.
     """
     track = Track(cfg, RunFile(cfg))
     if not track.finished_before:
@@ -123,7 +123,7 @@ def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) ->
     except (KeyboardInterrupt, BrokenPipeError):
         for track in party:
             if track.open:
-                # The others are to be closed even if this one's file cannot be written.
+                # The other files must be closed even if this one cannot be written.
                 with suppress(ResultsError):
                     track.run.close("stopped", "interrupted")
         raise

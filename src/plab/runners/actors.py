@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
 
 DEVIATION_MIN = 0.01
-"""Least deviation by which observations are scaled [domain units, and those per unit of time]: blown up, what
-hardly changes would rule the gradient through the policy's reaction."""
+"""Least standard deviation for scaling observations [domain units, domain units / s]. Otherwise nearly
+constant entries, scaled up, would dominate the gradient through the policy."""
 
 FIRST_SCENE = 1000
 """``seed_scene`` of the first of the scenes that ``method.scenes`` asks for."""
@@ -49,8 +49,8 @@ class ActorConfig(PolicyConfig):
 
 
 def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.nn.Sequential:
-    """Return a network, each hidden layer followed by ELU and LayerNorm: without that, actions come to the
-    ends of the hyperbolic tangent, where nothing is learned any more."""
+    """Return a network with ELU and LayerNorm after each hidden layer. Without LayerNorm, the hyperbolic
+    tangent of the actions saturates and learning stops."""
     (entries,) = spaces.observation_space.shape
     layers: list[torch.nn.Module] = []
     for width in hidden:
@@ -60,8 +60,8 @@ def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.
 
 
 def actor_policy(spaces: Spaces, hidden: Sequence[int]) -> Any:
-    """Return Stable-Baselines3's policy whose actions are the hyperbolic tangent of :func:`actor_network`,
-    with torch's own initial weights."""
+    """Return Stable-Baselines3's policy with the hyperbolic tangent of :func:`actor_network` as actions and
+    torch's default initial weights."""
     from stable_baselines3.common.torch_layers import FlattenExtractor
     from stable_baselines3.td3.policies import Actor
 
@@ -84,13 +84,13 @@ class ActorTraining(Training):
     Attributes:
         network: The policy.
         statistics: Moments of the observations, by which they are scaled.
-        broken: Times and reasons of the episodes that broke off since the last evaluation.
+        broken: Times and reasons of the episodes that diverged since the last evaluation.
     """
 
     round_episodes = 1, 1
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Begin; the configuration's seed is that of the initial weights and of what is drawn later."""
+        """Begin; the configuration's seed determines the initial weights and all later random numbers."""
         from stable_baselines3.common.running_mean_std import RunningMeanStd
 
         (cfg,) = cfgs
@@ -137,7 +137,7 @@ class ActorTraining(Training):
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
     def freeze_moments(self) -> None:
-        """Scale observations by the moments as they are now."""
+        """Scale observations by the current moments from here on."""
         mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self.moments(0))
         self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
 
@@ -215,6 +215,6 @@ def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0)
         some = min(method.scenes, count)
         seeds = [FIRST_SCENE + (turn * some + k) % method.scenes for k in range(some)]
         drawn = drawn_configs(cfg, seeds)
-        # Building them says what is wrong with all of them.
+        # Errors of these scenes are raised when they are built.
         scenes = [one for one in drawn if fits(one)] or drawn
     return [scenes[k % len(scenes)] for k in range(count)]

@@ -1,8 +1,8 @@
 """Agents that learn in step with each other, as ``sac``, ``td3`` and ``ppo`` have them: one or many at once.
 
 The agents share nothing but the launches: parameters are stacked, [agent, ...], and multiplied in batches.
-Each has environments, a replay buffer, statistics and random numbers of its own, starts with the networks
-that Stable-Baselines3 would give it, and does what Stable-Baselines3 does, update by update.
+Each agent has its own environments, replay buffer, statistics and random numbers, starts with
+Stable-Baselines3's initial networks, and makes the same updates as Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from torch.optim import Adam
 
 LARGEST = 2**62
-"""Integers are drawn below it, and taken modulo what is asked for: then they are uniform to 1e-12."""
+"""Bound of the random integers that are reduced modulo the requested range; uniform to 1e-12."""
 
 
 @dataclass
@@ -38,7 +38,7 @@ class RlConfig(PolicyConfig):
         profile: Profile that gives the values that are not overridden; None: there are no profiles.
         num_envs: Environments simulated together.
         gamma: Discount factor.
-        profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
+        profiles: Values by profile. Empty in the configuration of a run, whose fields have the values.
     """
 
     profile: str | None
@@ -73,7 +73,7 @@ class OffPolicyConfig(RlConfig):
 
 
 class AgentRandom:
-    """Random numbers of K agents on a device; what one draws does not depend on the others."""
+    """Independent random number generators of K agents on a device."""
 
     BLOCK = 50
     """Entries that :meth:`block` draws at once."""
@@ -121,7 +121,7 @@ class AgentRandom:
 
 
 class Agents:
-    """K agents that stand at the same step; each is what an agent alone is.
+    """K agents trained in lockstep; each is equivalent to a single agent.
 
     Attributes:
         sizes: Sizes of their episodes.
@@ -137,7 +137,7 @@ class Agents:
     """Modules of Stable-Baselines3's policy, by the parts of :class:`Networks`."""
 
     LOSSES: ClassVar[Sequence[str]]
-    """Names of what an update returns, as in Stable-Baselines3's logs."""
+    """Names of the losses returned by an update, as in Stable-Baselines3's logs."""
 
     optimizers: dict[str, Adam]
     watched = False
@@ -197,7 +197,7 @@ class Agents:
         ``observations``, which are the last ones unless the episodes are ``over``."""
 
     def _tables(self) -> dict[str, list[Tensor]]:
-        """Return the stacked tensors of which an agent's state has a row each, by their names in it."""
+        """Return the stacked tensors with one row per agent, by their names in an agent's state."""
         tables = {"networks": self.networks.parameters()}
         tables |= {name: [tensor] for name, tensor in self.tensors.items()}
         for name, optimizer in self.optimizers.items():
@@ -235,13 +235,13 @@ class Agents:
         return [{name: row[agent] for name, row in means.items()} for agent in range(self.count)]
 
     def _note(self, losses: Tensor) -> None:
-        """Keep what an update returned, shape [loss, agent]; the last of :attr:`LOSSES` may be missing."""
+        """Record the losses of an update, shape [loss, agent]; the last of :attr:`LOSSES` may be missing."""
         if self.watched:
             for name, row in zip(self.LOSSES, losses, strict=False):
                 self._losses.setdefault(name, []).append(row.clone())
 
     def _captured(self, update: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Call a function that is recorded on CUDA; what it returns is overwritten by the next call."""
+        """Call a function that is captured as a CUDA graph; the next call overwrites its results."""
         return self._updates.setdefault(update.__name__, CapturedUpdate(update))(*arguments)
 
 

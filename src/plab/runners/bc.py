@@ -33,7 +33,7 @@ class BcConfig(PolicyConfig):
 
     Attributes:
         dataset: Folder of a dataset of this task, with the same observation.
-        demonstrations: Episodes of the dataset to learn from, at most; None: all.
+        demonstrations: Maximum number of episodes of the dataset to learn from; None: all.
         episodes: Episodes to learn from, each pass over the dataset counted; rounded up to whole passes.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations, in units of theirs.

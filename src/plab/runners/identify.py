@@ -1,9 +1,9 @@
 """System identification: ``identify`` fits material, friction and gravity to observed particles.
 
-Gauss-Newton with Levenberg's damping on the positions of an episode of a dataset, whose actions are simulated
-with each parameter a little larger and smaller, all in one batch. The standard deviations are those of
-Laplace's approximation, with the noise that the residuals show. The configuration has the first guess. To
-reproduce a result:
+Gauss-Newton method with Levenberg's damping on the particle positions of an episode of a dataset. Derivatives
+are central differences, with all simulations in one batch. The standard deviations are those of Laplace's
+approximation, with the noise that the residuals show. The configuration has the first guess. To reproduce a
+result:
 
     plab dataset task=Torus variant=1
     plab run task=Torus method=identify task.yield_stress=100 seed=0
@@ -39,7 +39,7 @@ class IdentifyConfig(MethodConfig):
     Attributes:
         dataset: Folder of a dataset of this task and variant; the observation is ``state`` or ``particles``.
         episode: Number of its episode that is fitted.
-        parameters: Parameters that are fitted, of :data:`PARAMETERS`; the others are the task's.
+        parameters: Fitted parameters, out of :data:`PARAMETERS`; the others are the task's.
         iterations: Simulations of all parameters' changes, hence steps.
         difference: Relative change of a parameter for central differences.
         damping: First damping, relative to the curvature.

@@ -53,16 +53,16 @@ class RunLog:
     def close(self) -> None:
         """End the log."""
         if self._logger is not None:
-            # All rows have been written; what they belong to is in the result file.
+            # All rows have been written; the final evaluation is in the result file.
             with suppress(OSError, RuntimeError):
                 self._logger[1]()
             self._logger = None
 
 
 def _tensorboard(cfg: Config, run: RunFile, steps: int) -> tuple[Write, Callable[[], object]]:
-    """Begin an event file of TensorBoard in the folder ``<name>.tensorboard`` beside the result.
+    """Open a TensorBoard event file in the folder ``<name>.tensorboard`` beside the result.
 
-    What an earlier process has logged from ``steps`` on is not shown any more.
+    TensorBoard hides entries of earlier processes after ``steps``.
     """
     # Imported here: it is optional.
     from torch.utils.tensorboard.writer import SummaryWriter
@@ -92,7 +92,7 @@ def _wandb(cfg: Config, run: RunFile, steps: int) -> tuple[Write, Callable[[], o
         begun = wandb.init(
             project=os.environ.get("WANDB_PROJECT") or PROJECT,
             name=name,
-            # An id has at most 128 letters.
+            # Ids are limited to 128 characters.
             id=re.sub(r"[^\w.-]", "_", name)[:128],
             dir=cfg.results_dir,
             config=run.result.config,

@@ -1,7 +1,7 @@
 """Networks of many agents as one: stacked parameters of Stable-Baselines3's policies, and their updates.
 
-An update of these small networks is a hundred kernels of a few microseconds each, and what takes the time is
-launching them one by one from Python. On CUDA it is recorded once as a graph and replayed: one launch.
+An update of these small networks has a hundred kernels of a few microseconds each, dominated by the time to
+launch them from Python. On CUDA it is recorded once as a graph and replayed: one launch.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ transposed, [stack, in, out], so that neither products nor gradients have to be.
 class Networks:
     """The parameters of K policies of one kind, stacked; a part is a module, or several of the same shape.
 
-    Modules that are evaluated together, such as two critics, are one part, whose stack is K times as many:
-    those of the first agent, then those of the second.
+    Modules that are evaluated together, such as two critics, form one part; its stack has the modules of the
+    first agent, then those of the second, etc.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ def _transposed(parameter: Tensor) -> Tensor:
 
 
 def flat(tensors: Sequence[Tensor], agents: int) -> Tensor:
-    """Return what stacked tensors hold as one row per agent, shape [agent, number]."""
+    """Return stacked tensors as one row per agent, shape [agent, number]."""
     return torch.cat([tensor.detach().reshape(agents, -1) for tensor in tensors], dim=1)
 
 
@@ -102,7 +102,8 @@ def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
-    """Return Adam for stacked parameters, whose state is there from the start: one step serves all agents."""
+    """Return Adam for stacked parameters, with its state allocated in advance; one step updates all
+    agents."""
     optimizer = torch.optim.Adam(parameters, lr=lr, fused=True, **options)
     for parameter in parameters:
         optimizer.state[parameter] = {
@@ -116,8 +117,8 @@ def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
 
 
 def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> None:
-    """Make one step of an optimiser against the loss of each agent, shape [agent], none of which depends
-    on another's parameters; gradients longer than ``longest`` are scaled down to that, agent by agent."""
+    """Make one step of an optimiser on the independent losses of the agents, shape [agent]; the gradient of
+    each agent is clipped to the norm ``longest``."""
     parameters = optimizer.param_groups[0]["params"]
     gradients = torch.autograd.grad(losses.sum(), parameters)
     if longest is not None:
@@ -140,14 +141,14 @@ def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
 # -------------------------------------------------------------------------------------- CUDA graphs
 
 WARM_UP = 3
-"""Updates before the first recording: libraries and optimisers allocate what they need."""
+"""Number of updates before graph capture, in which libraries and optimisers allocate memory."""
 
 
 class CapturedUpdate:
     """An update of a model, on CUDA recorded once for each shape of its arguments and replayed from then on.
 
     The function may change parameters and optimisers in place, and may draw random numbers of the device. It
-    must not wait for the device, and what it depends on beside its arguments must stay where it is in memory.
+    must not synchronise with the device, and all data besides its arguments must keep their addresses.
     """
 
     def __init__(self, update: Callable[..., Tensor]) -> None:
@@ -174,7 +175,7 @@ class CapturedUpdate:
         return result
 
     def _warm_up(self, *arguments: Tensor) -> Tensor:
-        # In a stream of its own, as recordings are.
+        # In a separate stream, as required for capture.
         stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
         stream.wait_stream(current)
         with torch.cuda.stream(stream):

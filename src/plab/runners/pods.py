@@ -4,10 +4,10 @@ the simulator's gradient has improved them.
 After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates of Adam
 in place of a step of gradient descent or of second order. In a round the policy acts, in each scene; the
 actions that it took are improved by some updates along the gradient of the trajectory's loss; they are run
-again, and the policy learns to take them where they lead, and where it came without them. What the gradient
-improves is a sequence of actions, which is much easier than a network; what keeps the sequences of different
-scenes alike is that all of them begin as the policy's. Where there are more scenes than environments, rounds
-take them in turn, and the policy imitates what each scene gave the last time. To reproduce a result:
+again, and the policy learns to take them where they lead, and where it came without them. The gradient
+improves action sequences, which is much easier than improving a network. The sequences of different scenes
+remain similar, because all of them start from the policy. If there are more scenes than environments, rounds
+alternate between them, and the policy imitates the latest actions of each scene. To reproduce a result:
 
     python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true observe_particles=10 \
         method=pods method.scenes=1280 method.shift=0.2 method.episodes=15360 seed=0 sim.device=cuda
@@ -59,7 +59,7 @@ class PodsTraining(Imitation):
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
         updates = cfgs[0].method_as(PodsConfig).updates
-        # The policy's own, those with gradient, and those of what they led to.
+        # Episodes of the policy, with gradient, and with the improved actions.
         self.round_episodes = updates + 2, updates
         super().__init__(cfgs, batch)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
@@ -76,7 +76,7 @@ class PodsTraining(Imitation):
         improved = self._improved(actions, method.action_lr * rate_left)
         after, _ = self._episode(improved, "plan")
         if whole := [e for e in range(batch.size) if e not in self._failed]:
-            # Also where it came without them: what comes off its way is led back to it.
+            # Also in the states of its own episodes, so that deviations are corrected.
             seen = torch.cat([before[whole], after[whole]]).flatten(0, 1)
             wanted = torch.cat([improved[whole]] * 2).flatten(0, 1)
             self.statistics.update(seen.double().cpu().numpy())
@@ -94,7 +94,7 @@ class PodsTraining(Imitation):
         from plab.envs.tensors import TensorEnv
 
         env, observed, taken, total = TensorEnv(self.batch), [], [], 0.0
-        # All episodes of a round are in what the round has drawn.
+        # All episodes of a round use the samples of the round.
         seen = env.reset(episode=self.episodes // (self.round_episodes[0] * self.batch.size))
         for t in range(self._horizon):
             with torch.no_grad():
@@ -119,7 +119,7 @@ class PodsTraining(Imitation):
             )
             self._note_failures(tried.failures)
             plan.grad = torch.as_tensor(tried.gradient, dtype=plan.dtype, device=plan.device)
-            # What broke off has no gradient.
+            # Diverged episodes have no gradient.
             plan.grad[list(self._failed)] = 0.0
             optimizer.step()
             with torch.no_grad():
@@ -144,7 +144,7 @@ class PodsRunner(ActorRunner):
     training = PodsTraining
 
     def training_configs(self) -> list[Config]:
-        """Return a scene for each environment, at most ``num_envs``."""
+        """Return one scene per environment, up to ``num_envs``."""
         method = self.method
         return training_scenes(self.tracks[0].cfg, method, min(max(1, method.scenes), method.num_envs))
 

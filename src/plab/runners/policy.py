@@ -1,8 +1,8 @@
 """Trained policies: their keys, settings of torch, and the file that keeps a policy.
 
-The file beside a result, ``<name>.policy.npz``, is arrays alone: the networks' parameters by their names, the
-bounds of observations and actions, and a header in JSON with the section ``method`` of the run, from which
-the networks are made anew. Reading it unpickles and imports nothing.
+The file beside a result, ``<name>.policy.npz``, contains only arrays: the parameters of the networks by name,
+the bounds of observations and actions, and a JSON header with the section ``method`` of the run, from which
+the networks are rebuilt. Reading it unpickles and imports nothing.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _PARAMETER = "policy/"
 
 @dataclass
 class PolicyConfig(MethodConfig):
-    """Keys of the methods whose trained policy is kept.
+    """Keys of methods that save their policy.
 
     Attributes:
         algorithm: Learning algorithm, one of the family's.
@@ -84,7 +84,7 @@ class Spaces(NamedTuple):
 
     @classmethod
     def of(cls, batch: EpisodeBatch) -> Spaces:
-        """Return the spaces of a batch whose observations are vectors."""
+        """Return the spaces of a batch with vector observations."""
         return cls(cast("Box", batch.observation_space), batch.action_space)
 
     @property
@@ -120,14 +120,14 @@ def packed(state: Mapping[str, Any]) -> np.ndarray:
 
 
 def unpacked(array: np.ndarray) -> dict[str, Any]:
-    """Return what :func:`packed` was given, on the CPU; nothing is executed."""
+    """Return the argument of :func:`packed`, on the CPU, without executing anything."""
     return torch.load(io.BytesIO(array.tobytes()), "cpu", weights_only=True)
 
 
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
-    """Return the policy with which a training begins, on the CPU; random numbers stay as they are.
+    """Return the initial policy of a training, on the CPU; the state of random generators is preserved.
 
-    The algorithm's rule in its family says how: it has ``make_policy(method, spaces)``.
+    It is created by ``make_policy(method, spaces)`` of the algorithm's rule.
     """
     rule = family(method.family).rules[method.algorithm].what
     with torch.random.fork_rng(devices=[]):
@@ -164,7 +164,7 @@ def policy_path(result: Path) -> Path:
 def save_policy(
     result: Path, method: PolicyConfig, policy: BasePolicy, moments: tuple[np.ndarray, np.ndarray] | None
 ) -> None:
-    """Write a policy beside the result.
+    """Write a policy file beside the result.
 
     Args:
         result: The run's result file.
@@ -197,8 +197,8 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         device: Device of the network, ``cpu`` or ``cuda``.
 
     Raises:
-        ResultsError: If there is no policy beside the result, its file is broken, or it is of a family
-            outside plab whose module has not been imported.
+        ResultsError: If the policy is missing, its file is damaged, or the module of its family, outside
+            plab, has not been imported.
     """
     path = policy_path(Path(result))
     try:
@@ -213,7 +213,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         raise ResultsError(
             f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
         ) from error
-    # What the device answers says nothing about the file.
+    # Errors of the device do not concern the file.
     policy.network = policy.network.to(device)
     return policy
 
@@ -244,7 +244,7 @@ def _policy(path: Path) -> Policy:
 def _method(section: Any, path: Path) -> PolicyConfig:
     """Return the section ``method`` that a policy's header holds, of the type of its family."""
     name = str(section["family"])
-    # A file does not choose what is imported.
+    # A file must not determine imports.
     if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
         raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} before")
     try:

@@ -41,8 +41,7 @@ class PpoConfig(RlConfig):
         max_gradient_norm: Longer gradients are scaled down to this norm.
         adam_eps: Added to adam's denominator.
         normalise: Scale observations and rewards by running statistics.
-        statistics_episodes: Episodes after which the statistics of observations stay as they are; None:
-            never.
+        statistics_episodes: Episodes after which the statistics of observations are frozen; None: never.
         bootstrap: Add the value of an episode's last observation to its rewards; else the episode is taken to
             end there.
         policy_gain: Gain of the first weights, which are orthogonal, of the policy's last layer.
@@ -142,7 +141,7 @@ class PpoAgents(Agents):
 
     @staticmethod
     def make_policy(method: PpoConfig, spaces: Spaces) -> ActorCriticPolicy:
-        """Return Stable-Baselines3's policy, whose first weights are orthogonal, with the method's gains."""
+        """Return Stable-Baselines3's policy, with orthogonal initial weights and the method's gains."""
         from stable_baselines3.common.policies import ActorCriticPolicy
 
         policy = ActorCriticPolicy(

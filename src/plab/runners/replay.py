@@ -30,11 +30,13 @@ class Sizes(NamedTuple):
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def window(self, buffer_size: int) -> int:
-        """Return the latest steps of N environments that can be sampled from so many transitions."""
+        """Return the number of latest steps of N environments that can be sampled, given the number of
+        transitions."""
         return max(buffer_size // self.envs, 1)
 
     def capacity(self, buffer_size: int, total_steps: int) -> int:
-        """Return the episodes of N environments that a buffer holds, in a training of so many transitions."""
+        """Return the number of episodes of N environments in a buffer, given the number of training
+        transitions."""
         # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
         held = math.ceil(self.window(buffer_size) / self.horizon) + 1
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
@@ -59,7 +61,8 @@ class ReplayBuffer:
     def __init__(
         self, agents: int, sizes: Sizes, buffer_size: int, total_steps: int, device: torch.device
     ) -> None:
-        """Make room for the latest transitions of each agent, in a training of so many."""
+        """Allocate a buffer for the latest transitions of each agent, given the number of training
+        transitions."""
         self.added = 0
         self._agents, self._sizes, self._window = agents, sizes, sizes.window(buffer_size)
         self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
@@ -120,8 +123,8 @@ class ReplayBuffer:
         return 4 * self._agents * self._capacity * self._sizes.entries
 
     def write(self, agent: int, path: Path) -> None:
-        """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew;
-        ResultsError if that fails."""
+        """Append an agent's new episodes to its file, so that the file covers every checkpoint; ResultsError
+        if that fails."""
         since, last = self._written[agent], self.added // self._sizes.horizon
         try:
             with path.open("r+b" if since else "wb") as file:
@@ -134,8 +137,8 @@ class ReplayBuffer:
         self._written[agent] = last
 
     def read(self, agent: int, path: Path, added: int) -> None:
-        """Take what an agent's file holds of steps of N environments, in whole episodes, as many for all
-        agents; ResultsError if that fails."""
+        """Load whole episodes of N environments from an agent's file, the same number for all agents;
+        ResultsError if that fails."""
         self._count_to(added)
         self._written[agent] = last = added // self._sizes.horizon
         first = max(0, last - self._capacity)

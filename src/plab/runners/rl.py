@@ -43,7 +43,7 @@ def agents_of(method: RlConfig) -> type[Agents]:
 def population_settings(method: RlConfig) -> AbstractContextManager[None]:
     """Return torch's settings for a population: on CUDA products of matrices are TF32's.
 
-    The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
+    The first layers, with 1,200 inputs and more, dominate the time of an update on a GPU.
     """
     return torch_settings(method.torch_threads, tf32=method.torch_device == "cuda")
 
@@ -51,8 +51,8 @@ def population_settings(method: RlConfig) -> AbstractContextManager[None]:
 class Population(Training):
     """Agents that stand at the same step, and their environments.
 
-    On CUDA the agents' parameters are stacked. On the CPU each agent is a stack of its own: there libraries
-    choose their kernels by shape, and an agent would not have the bits that it has alone.
+    On CUDA the agents' parameters are stacked. On the CPU each agent is a separate stack: libraries select
+    kernels by shape, so a joint stack would not be bitwise identical to a single agent.
 
     Attributes:
         stacks: The agents.
@@ -163,7 +163,7 @@ class Population(Training):
         return observations
 
     def _step(self) -> None:
-        """Make one step of all environments, and what the agents learn from it."""
+        """Make one step of all environments, and the agents' updates."""
         parts = zip(self.stacks, self._split(self._observations), strict=True)
         done = self._advance(torch.cat([stack.act(part) for stack, part in parts]))
         last = self._own(done.observation, self._envs)
@@ -176,7 +176,7 @@ class Population(Training):
         self._observations = observations
 
     def _advance(self, actions: Tensor) -> Transition:
-        """Advance the environments, and note what an episode adds up to."""
+        """Advance the environments, and accumulate the totals of episodes."""
         done = self._env.step(actions.double().nan_to_num().flatten(0, 1), strict=False)
         self._reward += self._own(done.reward, self._envs).squeeze(2)
         self._actions.append(actions)
@@ -199,7 +199,7 @@ class Population(Training):
 
 def _require_memory(count: int, each: float, device: str, memory: float) -> None:
     """Raise RunError if there is no room for as many replay buffers; on the CPU there always is for one."""
-    # Networks take little beside them.
+    # The memory of the networks is negligible in comparison.
     room = 0.9 * torch.cuda.mem_get_info()[0] if device == "cuda" else max(memory, each)
     if count * each > room:
         raise RunError(

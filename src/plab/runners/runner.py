@@ -1,7 +1,7 @@
 """Base of all runners: files, rows, best actions, wall times, progress, failures and the final evaluation.
 
-A family of methods is a subclass of :class:`Runner`, whose hooks say how a run begins, what an iteration is
-and what the next one starts from.
+A family of methods is a subclass of :class:`Runner`, with hooks for the start of a run, an iteration, and the
+state between iterations.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ if TYPE_CHECKING:
 Kept = TypeVar("Kept")
 
 COLUMNS = ("loss", "reward", "iou", "score")
-"""Columns of the results that every method has: what an episode is measured by, beside the terms of its
-loss."""
+"""Columns of the results common to all methods: measures of an episode besides the loss terms."""
 
 FINAL_STATE_COLUMNS = ("iou", "score")
-"""Columns that judge the last state; the others are sums over the steps."""
+"""Columns that refer to the last state; the others are sums over the steps."""
 
 _STATE_ERRORS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
-"""Errors of NumPy and torch at a state of other arrays."""
+"""Errors of NumPy and torch for a state with other arrays."""
 
 
 class Runner:
@@ -75,11 +74,11 @@ class Runner:
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
-        """Refuse what cannot run, then make the runs' shared objects, :attr:`problem` at least."""
+        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`."""
         raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make a run's own objects, from a :attr:`Step.state` if there is one, else from nothing."""
+        """Create the objects of a run, from a :attr:`Step.state` when resuming."""
 
     def has_more(self, track: Track) -> bool:
         """Return whether a run has iterations left; by default up to ``method.iterations``."""
@@ -96,7 +95,7 @@ class Runner:
             tracks: The runs that have more to do.
 
         Yields:
-            Those that came through; others are to be broken off by :meth:`Track.fail`.
+            The successful runs; mark failed ones with :meth:`Track.fail`.
         """
         for track in tracks:
             yield track, self.step(track)
@@ -112,10 +111,10 @@ class Runner:
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
-        """Release the iterations' objects, even if they broke off."""
+        """Release the objects of the iterations, also after a failure."""
 
     def conclude(self, track: Track) -> None:
-        """Write a run's files beside its result, before the final evaluation."""
+        """Write additional files of a run, before the final evaluation."""
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Run actions, shape [batch, T, A], in the hard contact model."""
@@ -140,7 +139,7 @@ class Runner:
         text = f"{mean}loss {loss:.5g} {contact} score {score:.3f} best {best:.5g}"
         self.report(min(track.iteration for track in tracks), text)
 
-    # ------------------------------------------------------------------------------------ what hooks may use
+    # ------------------------------------------------------------------------------------ for use in hooks
 
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
         """Count the wall time from now on as that of another phase, of other runs if some are given; an
@@ -156,10 +155,11 @@ class Runner:
         scene = self.problem.scenes[0]
         return np.zeros((len(self.tracks), scene.horizon, scene.action_dim))
 
-    # ----------------------------------------------------------------------------------------- what is shared
+    # ----------------------------------------------------------------------------------------- shared
+    # implementation
 
     def run(self) -> None:
-        """Carry out the runs; one that breaks off does not disturb the others.
+        """Execute the runs; a failed run does not affect the others.
 
         Raises:
             TogetherError: If nothing can be built of several runs: perhaps fewer do.
@@ -208,7 +208,7 @@ class Runner:
         )
 
     def _start(self, track: Track) -> None:
-        """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
+        """Start a run, or resume it from its file; reject a state that does not fit this run."""
         result, scene = track.run.result, self.problem.scenes[0]
         result.labels = self.problem.labels
         if self._family.batching:
@@ -285,7 +285,7 @@ class Runner:
         distances = {"chamfer": chamfer_distance(*pair), "earth_movers": earth_movers_distance(*pair)}
         judged = measures(episodes, number) | distances
         try:
-            # After the last row, whose steps are those before it.
+            # After the last row, which counts the steps before it.
             steps = int(track.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
             track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
             track.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
@@ -304,8 +304,8 @@ class SimulatorCache:
         self._kept: dict[Any, Any] = {}
 
     def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
-        """Return something that holds a simulator: what is kept from the last run, if its key is the same and
-        ``check`` raises no RuntimeError, as its memory is gone; else what ``build`` makes."""
+        """Return the cached object of the last run if its key is equal and ``check`` does not raise
+        RuntimeError (its memory is invalid); otherwise a new one from ``build``."""
         # Somebody else may have restarted Taichi with another precision or device.
         with suppress(RuntimeError):
             if key in self._kept:
@@ -317,7 +317,7 @@ class SimulatorCache:
         return self._kept[key]
 
     def clear(self) -> None:
-        """Let go of what is kept."""
+        """Release the cached object."""
         if self._kept:
             self._kept.clear()
             gc.collect()
@@ -325,7 +325,7 @@ class SimulatorCache:
 
 def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
     """Return the scalars of the final evaluation of one environment: those of :func:`episode_columns`, and
-    what else scores are made of."""
+    the IoUs behind the scores."""
     sums = zip(result.term_names, result.terms[environment].sum(axis=0), strict=True)
     judged = result.scores[environment]
     return {
@@ -358,7 +358,7 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
 
 
 def simulator_key(cfg: Config, scene: Scene) -> Hashable:
-    """Return a key that is the same for configurations whose simulators differ in their scenes alone."""
+    """Return a key that is equal for configurations whose simulators differ only in their scenes."""
     from plab.sim.batch import scene_kind
 
     sim, method = cfg.sim, cfg.method
@@ -368,7 +368,7 @@ def simulator_key(cfg: Config, scene: Scene) -> Hashable:
 
 @contextmanager
 def simulation_errors(when: str = "") -> Iterator[None]:
-    """Turn what the simulator raises into a RunError, what it says of too little memory into a ConfigError;
+    """Convert errors of the simulator into RunError, and those about insufficient memory into ConfigError;
     ``when`` goes before the message."""
     from plab.sim import DeviceError, SimulationError
 

@@ -1,8 +1,8 @@
 """Learning algorithms with the interface of Stable-Baselines3, such as those of sb3-contrib, as methods.
 
 plab's own ``sac``, ``td3`` and ``ppo`` are in :mod:`plab.runners.rl`. An algorithm from outside needs a
-record with ``replace(FAMILIES["sb3"], ...)`` and a :class:`ModelKind`; see docs/own_method.md. A checkpoint
-holds what the library's own ``save`` writes, which is pickled: resume only runs of your own.
+record with ``replace(FAMILIES["sb3"], ...)`` and a :class:`ModelKind`; see docs/own_method.md. Checkpoints
+are written by the library's ``save``, which uses pickle, so resume only your own runs.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class ModelKind:
         model: Class with the interface of Stable-Baselines3's algorithms.
         arguments: Function of the section ``method`` and the environments that returns keyword arguments of
             the class, ``policy_kwargs`` among them.
-        rollout_steps: Function of the section ``method`` that returns the steps of each environment between
-            two updates, of an algorithm that learns from what it has just done; None of one with a replay
-            buffer, which can pause after any episode.
+        rollout_steps: Function of the section ``method`` that returns the number of steps of each environment
+            between updates, for on-policy algorithms; None of one with a replay buffer, which can pause after
+            any episode.
     """
 
     model: type[BaseAlgorithm]
@@ -117,7 +117,7 @@ class Sb3Training(Training):
         return self.model.num_timesteps
 
     def cycle(self) -> None:
-        # What the library would log stays with its logger.
+        # The library's log entries stay in its logger.
         self.model.learn(
             self._cycle_steps, callback=self._watch, log_interval=None, reset_num_timesteps=False
         )
@@ -218,7 +218,7 @@ class _Replay(LibraryBuffer):
         total_steps: int,
         **options: Any,
     ) -> None:
-        # The base class allocates arrays of its own, here of one row each.
+        # The base class allocates its own arrays, here with one row each.
         super().__init__(n_envs, observation_space, action_space, device, n_envs, **options)
         # The library's save makes a list of the tuple.
         self.kept = ReplayBuffer(1, Sizes(*sizes), buffer_size, total_steps, torch.device(self.device))

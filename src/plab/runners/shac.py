@@ -160,9 +160,9 @@ class ShacRunner(ActorRunner):
 
 
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:
-    """Return the TD(lambda) targets, shape [T, env], of a stretch of an episode that goes on behind it, by
-    rewards, shape [T, env], and values before each step and after the last, shape [T + 1, env]. A
-    ``decay`` (lambda) of 0 looks one step ahead, of 1 to the end."""
+    """Return the TD(lambda) targets, shape [T, env], of a part of an unfinished episode, from rewards, shape
+    [T, env], and values before each step and after the last, shape [T + 1, env]. A ``decay`` (lambda) of 0
+    looks one step ahead, of 1 to the end."""
     targets, ahead = [], values[-1]
     for reward, value in zip(rewards.flip(0), values[1:].flip(0), strict=True):
         ahead = reward + gamma * ((1.0 - decay) * value + decay * ahead)

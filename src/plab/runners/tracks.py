@@ -81,7 +81,7 @@ class Track:
         cfg: Configuration.
         run: File.
         number: Number of the run in its batch, and of its environment in a simulator that they share.
-        error: Reason for which it broke off, if it did.
+        error: Reason of the failure, if any.
         iteration: Number of the next iteration.
         best_loss: Loss of the best actions so far, NaN before the first iteration.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
@@ -106,7 +106,7 @@ class Track:
 
     @property
     def open(self) -> bool:
-        """Return whether the run has neither finished nor broken off."""
+        """Return True if the run has neither finished nor failed."""
         return self.error is None and not self.run.finished
 
     @property
@@ -149,16 +149,17 @@ class Track:
         return Outcome.of(self.cfg, "refused" if is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
-        """Break the run off, also in its file, which keeps what it computed; the others of the batch go on.
+        """Mark the run as failed, also in its file, which keeps the results so far; the rest of the batch
+        continues.
 
-        A run that is refused before it computes anything leaves no file.
+        A run that is rejected before its first iteration leaves no file.
 
         Args:
-            why: An error, or what went wrong in the current iteration.
+            why: An error, or the reason of the failure in the current iteration.
         """
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
         if isinstance(error, ResultsError) or (is_refusal(error) and not self.run.advanced):
-            # Of a ResultsError the file itself is what failed: nothing more can be written to it.
+            # After a ResultsError nothing can be written to the file.
             self.run.discard()
         elif self.run.result.rows or not is_refusal(error):
             try:
@@ -229,8 +230,8 @@ class Outcome:
     Attributes:
         title: Task, variant, method and seed.
         path: The run's final file.
-        status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (a mistake
-            of the user's), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
+        status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (invalid
+            input), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
         score: Score of the final evaluation, NaN if there is none.
         message: Why it has not finished, one line.
     """

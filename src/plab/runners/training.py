@@ -55,8 +55,8 @@ class Evaluation:
     Attributes:
         measures: Values of :func:`plab.runners.runner.episode_columns`.
         actions: Actions, shape [T, A].
-        failure: Time and reason if it broke off, else empty; from then on it rests as
-            :meth:`plab.envs.core.EpisodeBatch.step` has it.
+        failure: Time and reason of a divergence, or empty. The episode is frozen afterwards, see
+            :meth:`plab.envs.core.EpisodeBatch.step`.
     """
 
     measures: dict[str, float]
@@ -128,7 +128,7 @@ class TrainingSummary:
     Attributes:
         measures: Means over the episodes that ended, by the training's columns; NaN if none has.
         ended: Number of these episodes.
-        broken: Times and reasons of those that broke off; their environments rested until their end.
+        broken: Times and reasons of divergences; these environments were frozen until the end of the episode.
         losses: Mean losses of the updates, by name.
     """
 
@@ -144,7 +144,7 @@ class Training(ABC):
     Attributes:
         batch: Environments of the training.
         total_steps: Transitions of each policy in the whole training, in whole cycles.
-        watched: Losses of the updates are asked for.
+        watched: Losses of the updates are requested.
         report: Function to call when episodes have ended.
     """
 
@@ -158,7 +158,8 @@ class Training(ABC):
     report: Callable[[], None]
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch, cycle: int) -> None:
-        """Begin a training of ``method.episodes``, in cycles of so many transitions of each policy."""
+        """Begin a training of ``method.episodes`` episodes, in cycles with the given number of transitions
+        per policy."""
         self.batch, self._horizon = batch, batch.horizon
         self.total_steps = whole_cycles(cfgs[0].method_as(PolicyConfig).episodes * self._horizon, cycle)
         self.report = lambda: None
@@ -349,7 +350,7 @@ class PolicyRunner(Runner):
         self.report(self.policies.episodes, pace + self._shown)
 
     def conclude(self, track: Track) -> None:
-        """Keep the policy of the last evaluation, after which nothing is sampled any more."""
+        """Keep the policy of the last evaluation; sampling has ended."""
         policy, moments = self.policies.policy(track.number), self.policies.moments(track.number)
         save_policy(track.run.path, self.method, policy, moments)
         _replay_path(track).unlink(missing_ok=True)
@@ -360,8 +361,8 @@ def _replay_path(track: Track) -> Path:
 
 
 def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
-    """Return why a run cannot go on, or an empty text; count episodes that broke off in the result's
-    provenance, and warn of them."""
+    """Return the reason why a run cannot continue, or an empty text; count diverged episodes in the result's
+    provenance, with a warning."""
     broken = learned.broken
     if not np.isfinite(done.actions).all():
         return NOT_FINITE

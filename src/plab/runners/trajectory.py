@@ -22,7 +22,8 @@ from plab.config.families import GRADIENT, Appearance, Family, Rule, family
 from plab.runners.runner import Runner, Step, Track, measures, shared_problem
 
 CHECK_INTERVAL = 10
-"""Iterations after which the best actions since the last check are run in the hard contact model."""
+"""Interval at which the best actions since the last check are evaluated in the hard contact model
+[iterations]."""
 
 
 @dataclass
@@ -32,15 +33,15 @@ class TrajectoryConfig(MethodConfig):
     Attributes:
         optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
-        lr_by_task: Learning rates by whose numbers the task has, and task, or ``other``. Empty in a run's
-            configuration: what was used is in ``lr``.
-        contact_by_task: Weights of the contact term by term and task. Empty likewise: what was used is in
-            ``loss_weights``.
+        lr_by_task: Learning rates by ``protocol.numbers`` and task, or ``other``. Empty in a run's
+            configuration of a run; ``lr`` has the value.
+        contact_by_task: Weights of the contact term by term and task. Empty likewise; ``loss_weights`` has
+            the value.
         betas: Decay rates of adam's two moment estimates.
         eps: Added to adam's denominator.
         momentum: gd's momentum, on (1 - momentum)-weighted gradients.
         max_gradient_norm: Longer gradients are scaled down to this norm; None sets no limit.
-        max_gradient_norm_by_numbers: Limits by whose numbers the task has. Empty likewise.
+        max_gradient_norm_by_numbers: Limits by ``protocol.numbers``. Empty likewise.
         iterations: Rollouts with gradient, hence updates.
         action_init: Initial actions are uniform in +- this.
     """
@@ -65,7 +66,7 @@ class TrajectoryConfig(MethodConfig):
 class TrajectoryRunner(Runner):
     """Runner of a sequence of actions per run; each iteration is one rollout of all, with gradient.
 
-    A run whose loss, gradient or state stops being finite breaks off, and the others go on.
+    If loss, gradient or state of a run diverge, the run fails, and the others continue.
     """
 
     def build(self) -> None:
@@ -220,7 +221,7 @@ class Finalists:
                 self._named[name] = new
 
     def keep_best(self) -> Finalist | None:
-        """Return the checked finalist that is better than what is kept, if any, and forget the highest."""
+        """Return the checked finalist if it is better than the kept one, and reset the highest score."""
         best = None
         for one in (self._named.pop("highest"), self._named["lowest"]):
             better = not one.hard_score <= self.kept_score or (
@@ -300,7 +301,7 @@ class Momentum(UpdateRule):
 def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     """Draw numbers uniform in [0, 1), float64: those of ``torch.rand`` from a generator of the same seed.
 
-    They are the lower 53 bits of two outputs of the Mersenne Twister, the first of which comes first.
+    They are the lower 53 bits of two consecutive outputs of the Mersenne Twister.
     """
     twister = np.random.RandomState(seed % 2**32)
     words = twister.randint(0, 2**32, (*shape, 2), dtype=np.uint32).astype(np.uint64)

@@ -1,6 +1,6 @@
 """Planners: searches for a sequence of actions with many candidates, which a simulator tries together.
 
-:mod:`plab.runners.planners.planner` has what they share.
+:mod:`plab.runners.planners.planner` has their common base.
 """
 
 from plab.config.families import Appearance, Family, Rule

@@ -32,8 +32,8 @@ class MultistartConfig(PlannerConfig):
         softness_end: The softness goes from ``softness`` to this over the iterations, by the same factor in
             each; None: it stays.
         replace_every: Iterations after which the worse half is replaced.
-        fresh: Share of the replaced candidates that start anew; the others start beside a better one, no
-            farther off than ``action_init``.
+        fresh: Fraction of the replaced candidates with a new start; the others start near a better candidate,
+            within ``action_init``.
     """
 
     lrs: list[float]
@@ -55,7 +55,7 @@ class MultistartConfig(PlannerConfig):
 
 
 class Multistart(Planner):
-    """Gradient descent of candidates that have moments and, in turn, learning rates of their own."""
+    """Gradient descent of candidates, each with its own moments and learning rate."""
 
     method: MultistartConfig
 
@@ -118,7 +118,7 @@ class Multistart(Planner):
             place.data.clamp_(-1.0, 1.0)
 
     def _replace(self, order: Tensor, random: torch.Generator) -> None:
-        """Put new candidates into the places of the worse half: some afresh, some beside a better one."""
+        """Replace the worse half of the candidates, some by new starts, some by neighbours of better ones."""
         better, worse = order.tensor_split([(len(order) + 1) // 2])
         fresh = self.start.draw(self.method, round(self.method.fresh * len(worse)), random)
         beside = len(worse) - len(fresh)

@@ -1,8 +1,9 @@
 """Base of the planners: keys, candidates tried in one simulator, starts, stages, and the runner.
 
-A planner asks for candidates to be tried, by ``yield``, and is sent what they gave; the runner tries those of
-all runs of a batch together. Candidates, losses, scores and gradients are tensors on the simulator's device.
-A row of the results is the best candidate of an iteration, always in the hard contact model.
+A planner is a generator that yields candidates and receives their evaluation; the runner evaluates the
+candidates of all runs of a batch together. Candidates, losses, scores and gradients are tensors on the
+simulator's device. A row of the results is the best candidate of an iteration, always in the hard contact
+model.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ class PlannerConfig(MethodConfig):
 
     Attributes:
         algorithm: Search algorithm, one of the family's rules.
-        iterations: Rows of the result; what one costs is up to the planner.
+        iterations: Rows of the result; the cost of a row depends on the planner.
         population: Candidates, each a sequence of actions.
         objective: Ranking of candidates: ``loss``, that of the whole episode; ``final``, that of its
             last step; or ``score``, and the loss where the score is 0.
         action_init: Random candidates are uniform in +- this.
-        contact_starts: Share of the candidates to start from that drive manipulators to the body and push or
+        contact_starts: Fraction of the initial candidates that move manipulators to the body and push or
             carry it towards the target; the others are random.
     """
 
@@ -79,8 +80,8 @@ class Answer:
     Attributes:
         measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
         final_loss: Loss of the last step, shape [P].
-        gradient: Gradient of ``loss``, shape [P, T, A], 0 for what broke off; None if it was not asked for.
-        broken: Candidates that broke off, shape [P], bool; their numbers mean nothing.
+        gradient: Gradient of ``loss``, shape [P, T, A], 0 for diverged candidates; None if not requested.
+        broken: Diverged candidates, shape [P], bool; their numbers are meaningless.
     """
 
     measures: dict[str, Tensor]
@@ -89,9 +90,9 @@ class Answer:
     broken: Tensor
 
     def cost(self, objective: str) -> Tensor:
-        """Return the costs that rank candidates, shape [P]: infinite for those that broke off."""
+        """Return the costs that rank candidates, shape [P], infinite for diverged ones."""
         loss, score = self.measures["loss"], self.measures["score"]
-        # Where the score is 0 the loss still tells one from another, between 0 and 1.
+        # Candidates with score 0 are ranked by their loss, mapped to values between 0 and 1.
         by_score = torch.where(score > 0, -score, loss / (1.0 + loss))
         cost = {"loss": loss, "final": self.final_loss, "score": by_score}[objective]
         return torch.where(self.broken, torch.inf, cost)
@@ -171,7 +172,7 @@ class Planner(ABC):
         return torch.cat([self.memory["champion"][None], self.candidates()])
 
     def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
-        """Do the next iteration, the first one perhaps from what a stage before has found."""
+        """Make the next iteration; the first one may start from the result of the previous stage."""
         if self.iteration == 0:
             nothing = torch.empty((0, *self.start.shape), dtype=torch.float64, device=self.start.device)
             self.begin(random, nothing if found is None else found)
@@ -180,7 +181,7 @@ class Planner(ABC):
         return shown
 
     def show(self, actions: Tensor, answer: Answer) -> Preview:
-        """Return the best of some candidates, by what they gave in the hard contact model."""
+        """Return the best of some candidates, given their evaluation in the hard contact model."""
         cost = answer.cost("score")
         best = int(cost.argmin())
         if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
@@ -207,11 +208,11 @@ def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
 
 @dataclass
 class StagesConfig(MethodConfig):
-    """Planners one after the other, ``hybrid`` and ``solve``, each from what the one before has found.
+    """Planners in sequence (``hybrid``, ``solve``), each starting from the result of the previous one.
 
     Attributes:
         algorithm: ``stages``.
-        stages: Planners by names of your choice, in order; each has the keys of a method of its own.
+        stages: Named planner stages, in order, each with the keys of a method.
     """
 
     algorithm: str
@@ -235,7 +236,7 @@ class StagesConfig(MethodConfig):
 
 
 class Stages:
-    """Planner that does what the planner of its stage does."""
+    """Planner that delegates to the planner of the current stage."""
 
     def __init__(self, method: StagesConfig, start: CandidateStart) -> None:
         self._methods, self._start = list(method.stages.values()), start
@@ -263,9 +264,9 @@ class Stages:
 class PlannerRunner(Runner):
     """Runner that tries the candidates of all runs of a batch together.
 
-    The simulator has as many environments per run as the smallest population, or fewer if the memory has no
-    room for more; what is more than that is tried one part after the other. A run ends when its score is the
-    highest there is; one whose candidates all break off, too.
+    The simulator has as many environments per run as the smallest population, or fewer if memory is limited;
+    larger populations are evaluated in parts. A run stops early once its score reaches 1, or if all of its
+    candidates diverge.
     """
 
     def context(self) -> AbstractContextManager[Any]:
@@ -342,7 +343,8 @@ class PlannerRunner(Runner):
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
-        """Try candidates of some runs, as many of each run; break off runs of which none came through."""
+        """Evaluate candidates of some runs, the same number per run; runs whose candidates all diverge
+        fail."""
         first = next(iter(requests.values()))
         softness = np.zeros(len(self.tracks))
         for track, request in requests.items():

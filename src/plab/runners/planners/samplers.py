@@ -1,9 +1,9 @@
 """Samplers: planners that draw curves of actions and learn from their costs, without a gradient.
 
-* ``cem``, the cross-entropy method: draw curves from a normal distribution, fit it to the best, again.
-* ``mppi``, model-predictive path integral: the mean of all curves, weighted by exp(-cost), again and again;
-  over the whole episode: the simulator is deterministic, so that planning anew on the way would gain nothing.
-* ``cmaes``, covariance matrix adaptation of a curve's points, by the library cmaes.
+* ``cem``, the cross-entropy method: sample curves from a normal distribution, fit it to the best, repeat. *
+``mppi``, model-predictive path integral: repeated mean of all curves, weighted by exp(-cost), over the whole
+episode; with a deterministic simulator, replanning during the episode would gain nothing. * ``cmaes``,
+covariance matrix adaptation of a curve's points, by the library cmaes.
 
 To reproduce a result:
 
@@ -35,7 +35,7 @@ class SamplerConfig(PlannerConfig):
     """Keys of the planners that draw candidates and learn from their costs, without a gradient.
 
     Attributes:
-        knots: Actions are a curve through so many points in time, at most one per environment step.
+        knots: Number of points in time that define the curve of actions, at most one per environment step.
         curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
             the next.
         spread: Standard deviation of the first draws around the best start, of each point.
@@ -79,11 +79,11 @@ class Sampler(Planner):
 
     @property
     def knots(self) -> int:
-        """Points of a curve, at most one per step."""
+        """Number of points of a curve, at most one per step."""
         return min(self.method.knots, self.start.shape[0])
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        # The better half of what has been found, and starts for the others.
+        # Half of the candidates are the best ones so far, the others are new starts.
         kept = found[: self.method.population // 2]
         drawn = self.start.draw(self.method, self.method.population - len(kept), random)
         self.memory["candidates"] = torch.cat([kept, drawn])
@@ -92,7 +92,7 @@ class Sampler(Planner):
         return self.memory["candidates"]
 
     def iterate(self, random: torch.Generator) -> Asking:
-        """Try the starts, later what is drawn, and learn from it."""
+        """Evaluate the starts, later the samples, and learn from them."""
         method, first = self.method, self.iteration == 0
         if first:
             points = knots_of(self.memory["candidates"], self.knots)
@@ -125,7 +125,8 @@ class Sampler(Planner):
 
     @abstractmethod
     def learn(self, points: Tensor, cost: Tensor) -> None:
-        """Learn from curves, shape [P, K, A], and what they cost, shape [P], infinite for what broke off."""
+        """Learn from curves, shape [P, K, A], and their costs, shape [P], infinite for diverged
+        candidates."""
 
     def noise(self, random: torch.Generator) -> Tensor:
         """Draw standard normal numbers, shape [P, K, A]."""
@@ -156,7 +157,7 @@ class CemConfig(SamplerConfig):
 
 
 class Cem(Sampler):
-    """Sampler whose mean and standard deviation of each point follow those of the elites."""
+    """Sampler with the mean and standard deviation of the elites at each point."""
 
     method: CemConfig
 
@@ -241,7 +242,8 @@ class Cmaes(Sampler):
     def learn(self, points: Tensor, cost: Tensor) -> None:
         pairs = zip(points.flatten(1).cpu().numpy(), cost.tolist(), strict=True)
         self._search.tell(list(pairs))
-        # What the library keeps of its covariance is one triangle: a run that goes on has to have just that.
+        # The library uses only one triangle of its covariance, which must be restored exactly when a run
+        # resumes.
         self._search.__setstate__(self._search.__getstate__())
 
     def state(self) -> dict[str, Any]:

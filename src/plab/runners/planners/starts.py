@@ -3,8 +3,8 @@
 Some points of the body are assigned to as many of the target so that the ways are shortest in all (optimal
 transport). A start either pushes, each manipulator behind one of the points and along its way, or carries:
 each manipulator goes to the body nearest to it, presses, and takes the body's middle way. Of the target
-nothing is known but its mass tensor. Ways are straight, so that what stands in between is met earlier; where
-there are several bodies, some lead over it. Bodies that no manipulator is near to are taken to stay.
+nothing is known but its mass tensor. Paths are straight, so obstacles may be hit; with several bodies, some
+paths lead over them. Bodies that no manipulator is near to are taken to stay.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ ALIGNMENTS = 10
 """Assignments of several bodies, each after moving them by their middle ways; the last change nothing."""
 
 TUBE = 0.04
-"""Half width of what a manipulator is taken to meet on its way [domain units]."""
+"""Half width of the swept path in which a manipulator is assumed to make contact [domain units]."""
 
 PRESS_DEPTH = (0.0, 0.03)
-"""Range of how far manipulators press into a body before they carry it [domain units]."""
+"""Range of the depth to which manipulators press into a body before carrying it [domain units]."""
 
 ARCH = (0.0, 0.15)
-"""Range of how far half of the ways of what is carried go up first, and down again [domain units]."""
+"""Range of the height to which half of the carried bodies are lifted first [domain units]."""
 
 UNREACHED_COST = 100.0
-"""Points of a body that no manipulator is near to cost so many times their squared way."""
+"""Weight of the squared distance to the target for points of a body without a manipulator nearby."""
 
 OVERSHOOT = (0.5, 1.5)
 """Range of how far they push, in ways of the point that they push."""
@@ -54,7 +54,7 @@ def support(tool: Manipulator, direction: np.ndarray) -> float:
     """Return how far a manipulator, as it stands at the start, reaches from its position in a direction.
 
     Args:
-        tool: The manipulator; chopsticks, which hold between them what they are to carry, reach no farther.
+        tool: The manipulator; for chopsticks, which carry between the sticks, the result is 0.
         direction: Unit vector [3].
     """
     reach = _SUPPORT.get(tool.outline)
@@ -85,8 +85,8 @@ class ContactStarts:
         )
 
     def _with_joints(self, own: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Add the actions of an articulated model, if there is one, to those of the other manipulators: two
-        even motions of all joints, in the second of which a base that moves goes the bodies' middle way."""
+        """Append the actions of the articulated model, if any: two uniform motions of all joints; in the
+        second, a movable base follows the mean displacement of the bodies."""
         chain, steps = self._scene.kinematics, self._scene.horizon
         if chain is None:
             return own
@@ -120,7 +120,7 @@ class ContactStarts:
         for _ in range(ALIGNMENTS if len(scene.bodies) > 1 else 1):
             _, assigned = linear_sum_assignment(weight * cdist(points + moved, goals, "sqeuclidean"))
             ways = goals[assigned] - points
-            # Bodies stay whole: the next assignment is of what each one's middle way leaves over.
+            # Bodies stay whole: the next assignment uses the residuals after each body's mean displacement.
             moved = _middle_ways(ways, body)[body]
         return points, ways, body
 
@@ -195,8 +195,8 @@ def _rotation(tool: Manipulator) -> Rotation:
 
 
 def _action(tool: Manipulator, way: np.ndarray) -> np.ndarray:
-    """Return what takes a manipulator a way [3] [domain units] as far as it can without turning, one entry
-    per action component."""
+    """Return the motion of a manipulator along a displacement [3] [domain units], as far as possible without
+    rotation, one entry per action component."""
     if tool.kind.motion == "roll":
         axis = _rotation(tool).apply([0.0, 1.0, 0.0])
         return np.array([(axis[0] * way[2] - axis[2] * way[0]) / ROLL_RADIUS, 0.0, way[1]])
