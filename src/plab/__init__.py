@@ -7,8 +7,8 @@ import tempfile
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-# Before Taichi is imported, by whichever part of plab: it would print a banner on standard output, and send
-# version, platform and a number of its own to its makers.
+# Set before Taichi is imported: otherwise it prints a banner on standard output, and sends version, platform
+# and an id to its developers.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("ENABLE_QUADRANTS_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")

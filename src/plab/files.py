@@ -23,7 +23,7 @@ import numpy as np
 from plab.errors import PlabError
 
 LARGEST = 1 << 31
-"""Most bytes that an array, a table or a member of an archive may take in memory."""
+"""Largest size of an array, a table or an archive member in memory [bytes]."""
 
 _RATIO, _SMALL = 200, 1 << 24
 """Largest ratio of unpacked to packed size, for results above a size [B]. Deflate reaches 1,032."""
@@ -39,7 +39,7 @@ _LARGEST_SHAPE = 1 << 28
 
 
 class UnreadableError(ValueError):
-    """A file that is not what it should be; the message is the reason alone, without the file's name."""
+    """Invalid file; the message is the reason, without the file's name."""
 
 
 class ShapeError(PlabError, ValueError):
@@ -47,7 +47,7 @@ class ShapeError(PlabError, ValueError):
 
 
 def cache_dir() -> Path:
-    """Return the folder for what plab can make again: ``PLAB_CACHE_DIR``, or ``plab`` in the user's cache."""
+    """Return the cache folder: ``PLAB_CACHE_DIR``, or ``plab`` in the user's cache."""
     chosen = os.environ.get("PLAB_CACHE_DIR")
     if chosen:
         return Path(chosen)

@@ -51,7 +51,7 @@ TRANSPORT_PORTIONS = 512
 """Number of portions of mass in :func:`earth_movers_distance`."""
 
 TINY = 1e-12
-"""Share of the mass below which nothing has to move."""
+"""Fraction of the mass below which a difference counts as none."""
 
 TARGET_MASS = 1e-4
 """Mass above which a grid node belongs to the target."""
@@ -302,8 +302,8 @@ def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
         target: That of the target.
 
     Returns:
-        Of the mass that has to leave, then of that which has to arrive: its share of all mass, centroid (3)
-        and standard deviation along each axis (3) [domain units]; shape [14], float64.
+        Excess mass, then missing mass: fraction of all mass, centroid (3) and standard deviation along each
+        axis (3) [domain units] of each; shape [14], float64.
     """
     change = mass_change(start, target)
     node = np.indices(change.shape).reshape(3, -1) / len(change)
@@ -358,7 +358,7 @@ TERMS = {
 """Terms by name, as ``module:Class``."""
 
 _DEFAULT_TERMS = {"contact": "nearest"}
-"""Default terms of weights whose names are not in :data:`TERMS`."""
+"""Default implementations of weights with other names than :data:`TERMS`."""
 
 
 def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:

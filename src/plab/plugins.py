@@ -1,8 +1,7 @@
 """Objects that a configuration names as ``module:NAME``, plab's own and those of files outside it.
 
-A module is looked for where Python looks, then in the config folder of the command line (``--config-dir``)
-and in the folder above it: a method of your own is a Python file there. Results record the text alone, which
-is the same on every computer.
+Modules are searched for in Python's path, then in the config folder (``--config-dir``) and its parent folder.
+Results record the text alone, which is the same on every computer.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class LazyModule(ModuleType):
     """A module that is imported when one of its names is first used."""
 
     def __getattr__(self, name: str) -> Any:
-        """Import the module, and keep what the name stands for."""
+        """Import the module, and cache the object."""
         value = getattr(import_module(self.__name__), name)
         setattr(self, name, value)
         return value
@@ -41,9 +40,9 @@ def search_in(config_dir: str | Path) -> None:
 
 @contextmanager
 def exported_module_path() -> Iterator[None]:
-    """Let processes that are started inside the ``with`` block find the modules that this one finds."""
+    """Export the module path to processes started inside the ``with`` block."""
     before = os.environ.get("PYTHONPATH")
-    # What comes with Python is left out: the other process may be one of another version.
+    # Python's own folders are left out, because the other process may use another version.
     own = [path for path in sys.path if path and not path.startswith((sys.prefix, sys.base_prefix))]
     os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*own, *filter(None, [before])]))
     try:
@@ -86,7 +85,7 @@ def _imported(text: str, name: str) -> ModuleType:
     except SyntaxError as error:
         raise ConfigError(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
     except Exception as error:
-        # Of the module's own code: where it went wrong is what its author needs.
+        # Traceback in the module's own code, for its author.
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}, line {last.lineno}"
         raise ConfigError(f"'{text}': {where}: {type(error).__name__}: {error}") from error

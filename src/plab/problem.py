@@ -170,7 +170,7 @@ class Problem:
         simulator: Their simulator, in its initial state.
         term_names: Names of the terms of the loss; those of weight 0 are left out.
         weights: Their weights, shape [term].
-        labels: What they measure, with unit, by their columns in results.
+        labels: Labels with units, by column of results.
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
         initial_scores: How close the initial states are.
     """
@@ -180,7 +180,7 @@ class Problem:
 
         Args:
             cfgs: One configuration per environment, alike in ``protocol``, ``sim``, ``targets`` and the loss.
-            simulator: Simulator of the very same scenes and terms of the loss, if there is one already.
+            simulator: Existing simulator of the same scenes and loss terms, if any.
 
         Raises:
             plab.config.ConfigError: If the configurations do not fit together.
@@ -189,7 +189,7 @@ class Problem:
             plab.sim.DeviceError: If CUDA was asked for and is not there.
         """
         _require_alike(cfgs)
-        # Vectorised environments and seeds of a sweep are often alike: what they share is made once.
+        # Vectorised environments and seeds of a sweep often have equal scenes, which are built once.
         kinds = kinds_of(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or make_simulator(cfgs)
@@ -236,7 +236,7 @@ class Problem:
         particles: Mapping[int, np.ndarray],
         targets: Mapping[int, tuple[np.ndarray, np.ndarray]],
     ) -> None:
-        """Change what the next episodes start from; :meth:`note_starts` is due when they have started.
+        """Set the initial states of the next episodes; call :meth:`note_starts` when they have started.
 
         Args:
             scenes: One scene per environment, of the same kind as before.
@@ -333,7 +333,7 @@ class Problem:
         Args:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
             gradient: Whether to compute the gradient of the trajectory loss.
-            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
+            strict: Whether divergence of an environment is an error instead of an entry in ``failures``.
             exact: Whether to fetch the mass tensors of the last states and to score those, in float64. The
                 simulator's own IoU, which scores are taken from otherwise, agrees to its rounding and takes
                 no time.
@@ -401,7 +401,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
     Args:
         cfgs: One configuration per environment, one object where they are alike.
         simulator: Simulator of their scenes.
-        rebuild: Simulate even what is cached.
+        rebuild: Simulate also cached targets.
 
     Returns:
         Mass tensors, shape [batch, n, n, n].

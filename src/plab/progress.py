@@ -117,7 +117,8 @@ def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Call
 
 
 def show_line(text: str) -> None:
-    """Show on a terminal what is being measured, in a line of standard error that the next replaces."""
+    """Show the current measurement on a terminal, in a line of standard error that is overwritten by the
+    next."""
     if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

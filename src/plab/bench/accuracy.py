@@ -1,4 +1,4 @@
-"""Work-precision diagrams: what a run costs against how far it is from a fine reference.
+"""Work-precision diagrams: cost of a simulation against its distance from a fine reference.
 
     plab bench accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
     plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
@@ -12,9 +12,9 @@ grids: on the finest of them): root mean square of the final positions' distance
 of the mass tensors relative to the mass, score, and the gradient's relative norm and angle. Run times are
 those of an environment step with gradient, of one environment.
 
-The actions are 0.7 times a demonstration's, and the target is what the demonstration itself ends with in the
-hard contact model, so that scores are those of an attempt that half succeeds. The loss has the suite's terms
-of the mass tensor.
+The actions are 0.7 times those of a demonstration, and the target is the final state of the demonstration in
+the hard contact model, so that scores correspond to partial success. The loss has the suite's terms of the
+mass tensor.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ COLUMNS = (
 
 
 class UncheckedScene(Scene):
-    """A scene that may be above the stability limit, to show what happens there."""
+    """A scene that may exceed the stability limit, to show the effect."""
 
     @property
     def stable_dt(self) -> float:

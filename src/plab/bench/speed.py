@@ -102,7 +102,7 @@ def rows(
 
 
 def paper_row(overrides: Sequence[str], batch: int, steps: int, repeats: int) -> dict[str, object]:
-    """Return a task's milliseconds per environment step of one environment beside the paper's."""
+    """Return the milliseconds per environment step of one environment of a task, beside the paper's."""
     gc.collect()
     cfg = load_config(overrides)
     paper = paper_table("timing").set_index("task").loc[cfg.task.name]
@@ -128,7 +128,7 @@ def paper_row(overrides: Sequence[str], batch: int, steps: int, repeats: int) ->
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Time environment steps, print, write the files asked for; return 1 if a row needs too much memory."""
+    """Time environment steps, print, write the requested files; return 1 if a row needs too much memory."""
     parser = Parser("plab bench speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
@@ -146,13 +146,13 @@ def main(argv: Sequence[str]) -> int:
         options.task = list(suite_tasks()) if options.paper else ["Move"]
     quick, batches = options.quick, options.batch
     steps, repeats = options.steps or (5 if quick else 10), options.repeats or (3 if quick else 7)
-    # Taichi starts anew for each precision, so precisions change last.
+    # Taichi restarts for each precision, so precision is the outer loop.
     each = itertools.product(options.precision or [None], options.task or [None])
     words = [
         [*options.overrides, *([f"task={task}"] if task else []), *([f"sim.precision={p}"] if p else [])]
         for p, task in each
     ]
-    # Columns whose entries are shorter or longer than most.
+    # Widths of columns that differ from the default.
     widths = {"what": max(map(len, KINDS)), "task": 10, "device": 6, "batch": 5, "grid": 4}
     if options.paper:
         lines = (paper_row(own, batch, steps, repeats) for own in words for batch in batches)

@@ -39,7 +39,7 @@ MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
 
 HOLD = 10
-"""Longest that a bang-bang action is held [environment steps]."""
+"""Longest duration of a bang-bang action [environment steps]."""
 
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
@@ -163,7 +163,7 @@ def _target(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> Iterator[dict[str, object]]:
-    """Run at most a batch of cases of one group."""
+    """Run up to a batch of cases of one group."""
     full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
     simulator.set_scenes([case.scene for case in full])
     simulator.set_contact([case.contact for case in full])
@@ -224,7 +224,7 @@ def summarise(rows: Sequence[Mapping[str, object]]) -> int:
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Simulate the cases, print, write the file asked for; return the exit code."""
+    """Simulate the cases, print, write the requested file; return the exit code."""
     options = options_of(Parser("plab bench stability", __doc__), argv)
     return summarise(measure(options, stress_cases))
 

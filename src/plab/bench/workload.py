@@ -75,7 +75,7 @@ def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> W
     Raises:
         plab.scenes.SceneError: If the scene cannot be simulated.
         plab.targets.TargetError: If the target, which the best actions come from, has a mistake.
-        plab.sim.DeviceError: If CUDA was asked for and is not there.
+        plab.sim.DeviceError: If CUDA is not available.
     """
     simulator = make_simulator([cfg] * batch)
     scene = simulator.scenes[0]

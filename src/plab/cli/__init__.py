@@ -1,1 +1,1 @@
-"""Command lines: each in a module of its own, with what they have in common: arguments, tables, answers."""
+"""Command lines, one module each, and shared arguments, tables and messages."""

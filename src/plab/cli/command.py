@@ -44,7 +44,7 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             code = main(list(sys.argv[1:] if argv is None else argv)) or 0
-            # Not left to Python's end, which could only complain in lines of its own.
+            # Not left to interpreter shutdown, which would print its own messages.
             sys.stdout.flush()
             return code
         except SystemExit as stop:
@@ -76,7 +76,7 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
 
 
 def _close_output() -> int:
-    """Let what is still to be printed go nowhere, as nobody reads it; return the exit code."""
+    """Discard further output, because standard output is closed; return the exit code."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -132,7 +132,7 @@ def sources_and_words(
     """Tell results from words that choose among their runs, as ``task=Rope`` does.
 
     Args:
-        arguments: Names of results, as they are or as ``results=NAME``, and words. A folder with an equals
+        arguments: Names of results, plain or as ``results=NAME``, and selections. A folder with an equals
             sign in its name is a source if it exists.
         default: Source where none is named; None: none.
 
@@ -188,7 +188,7 @@ def results_source(text: str) -> Path:
 def to_write(text: str) -> Path:
     """Read the name of a file that can be written: hours of work should not end in none."""
     path = folder(text)
-    # Folders above it that are not there yet are for whoever writes it to make.
+    # Missing parent folders are created when writing.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
     if there.is_dir() == (there == path):
         raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if there.is_dir() else 'no'} folder")

@@ -148,7 +148,7 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
 
 
 def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
-    """Carry out runs, and return their best actions; those that break off are left out."""
+    """Execute runs, and return their best actions, without failed runs."""
     from plab.sweep.running import carry_here, run_batches
 
     for one in run_batches(cfgs, carry_here, together):
@@ -226,7 +226,7 @@ class _Recorder:
         self.spaces = seen, actions
 
     def play(self) -> Iterator[Episode]:
-        """Yield the episodes; what breaks off is left out."""
+        """Yield the episodes, without diverged ones."""
         size = self._batch.size
         for first in range(0, len(self._all), size):
             part = self._all[first : first + size]

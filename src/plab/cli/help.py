@@ -74,15 +74,15 @@ def help_text(config_dir: str | None = None) -> str:
 
 
 def full_help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help-all``: that of ``--help``, more examples, what each choice is, and every
-    key with its default and explanation."""
+    """Return the text of ``--help-all``: ``--help``, more examples, a description of each choice, and every
+    key with default and explanation."""
     parts = [_USAGE, _MORE_EXAMPLES, _FLAGS]
     keys = ["KEYS, with their defaults:", *(line for _, line in _keys(conf_folder() / "config.yaml", _LONG))]
     for group in (*GROUPS, EXPERIMENT):
         sign = "+" if group == EXPERIMENT else ""
         parts.append("SIMULATOR PRESETS" if group == "sim" else f"{group.upper()}S")
         for name, path in choices(group, config_dir).items():
-            # The first line of an experiment says where its keys go.
+            # The first line of an experiment is Hydra's package directive.
             lines = path.read_text(encoding="utf-8").removeprefix("# @package _global_\n").splitlines()
             parts.append(f"  {sign}{group}={name:<10} {lines[0].lstrip('# ')}")
             if group == "method" or name in ("plab", "fast", "Rope"):

@@ -35,7 +35,8 @@ _PAUSE = 5.0
 """Interval at which ``--follow`` reads the runs [s]."""
 
 _IDLE_CHECKS = 2
-"""Looks in a row at which no run is under way, until it ends: a sweep's next run may be about to begin."""
+"""Number of consecutive checks without a run in progress before following ends, because the next run of a
+sweep may be about to start."""
 
 
 @command_line

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from plab.config import Config
 
 KEYS_WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *RUN_ONLY_KEYS)
-"""Keys of a configuration that change no picture."""
+"""Configuration keys without effect on pictures."""
 
 _FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
 """Pixels of a film's frame, of a cell of the contact sheet, and of a frame of the film strip."""
 
 _MAX_FRAME_SIZE = 4096
-"""Pixels of a frame's side, at most: what every OpenGL can draw, and H.264 can hold."""
+"""Largest frame width and height [pixels], supported by all OpenGL versions and by H.264."""
 
 
 @command_line
@@ -194,7 +194,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         The output.
 
     Raises:
-        RenderError: If nothing is chosen, or two things are.
+        RenderError: If nothing is selected, or both a run and a task.
         plab.config.ConfigError: If the configuration is wrong.
     """
     # Imported here, as below: h5py and pandas load, for which no mistake should have to wait.

@@ -28,7 +28,7 @@ def main(argv: Sequence[str]) -> int:
     """Run one configuration, or a sweep.
 
     Returns:
-        Exit code: 0 if every result is there, 1 if a run broke off, 2 for a mistake of the user's.
+        Exit code: 0 if all results exist, 1 if a run failed, 2 for invalid input.
     """
     options = parser().parse_intermixed_args(argv)
     words, config_dir = prepared(options.overrides), options.config_dir

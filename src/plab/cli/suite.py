@@ -26,7 +26,7 @@ from plab.targets import EPISODE_STEPS
 
 
 def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str) -> Namespace:
-    """Add what both commands share, parse, and refuse overrides that have no effect on ``what``."""
+    """Add the shared arguments, parse, and reject overrides without effect on ``what``."""
     add = parser.add_argument
     add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     add("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
@@ -136,7 +136,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
     Args:
         task: Name of a task of the suite.
         overrides: Of the configuration.
-        rebuild: Simulate even what is cached.
+        rebuild: Simulate also cached targets.
 
     Returns:
         A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and

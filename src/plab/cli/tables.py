@@ -20,12 +20,12 @@ def measure_table(
     path: Path | None,
     widths: Mapping[str, int] | None = None,
 ) -> list[Mapping[str, object]]:
-    """Print a table, as its rows come, and write it to a file if there is one.
+    """Print a table row by row, and write it to a file if given.
 
     Args:
         columns: Names of the columns, in order.
-        rows: A value for each column; each row is printed and written before the next is asked for, so that
-            nothing is lost when the rest takes too long.
+        rows: A value per column; each row is printed and written before the next is requested, so that
+            interruptions lose nothing.
         path: CSV file to write, or None.
         widths: Least widths of columns on the screen, where the usual one does not do.
 
@@ -58,7 +58,7 @@ def measure_table(
 
 
 def write_csv(path: Path, rows: Iterable[Iterable[Any]], mode: str = "w", digits: int | None = None) -> None:
-    """Write rows to a CSV file, whose folder is made if need be.
+    """Write rows to a CSV file, creating its folder if necessary.
 
     Args:
         path: The file.
@@ -76,7 +76,7 @@ def write_csv(path: Path, rows: Iterable[Iterable[Any]], mode: str = "w", digits
 def print_table(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text", digits: int = 6
 ) -> None:
-    """Print a table; what there is no value of is empty, in JSON null.
+    """Print a table; missing values are empty, in JSON null.
 
     Args:
         columns: Names of the columns, in order.
@@ -111,7 +111,7 @@ def _text(value: Any, digits: int) -> str:
 def write_markdown(
     path: Path, heading: str, columns: Sequence[str], rows: Iterable[Mapping[str, object]]
 ) -> None:
-    """Write a heading and a table in Markdown, numbers as they are; the folder is made if need be."""
+    """Write a heading and a table in Markdown, without rounding numbers, creating the folder if necessary."""
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(str(row[name]) for name in columns) + " |" for row in rows]
     path.parent.mkdir(parents=True, exist_ok=True)

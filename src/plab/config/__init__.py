@@ -41,7 +41,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a part of the configuration when it is asked for."""
+    """Import attributes on first access."""
     # The types first: composing needs them while it is imported.
     for part in ("task", "run", "suite", "compose") if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")

@@ -63,7 +63,7 @@ TABLES = {
     "contact_by_task": "contact",
     "max_gradient_norm_by_numbers": "numbers",
 }
-"""Tables of a method, and the key of ``protocol`` whose value chooses a row."""
+"""Tables of a method, and the key of ``protocol`` that selects a row."""
 
 
 def _by_task(table: str, default: Any = None, *, _parent_: DictConfig, _root_: DictConfig) -> Any:
@@ -80,7 +80,7 @@ OmegaConf.register_new_resolver("by_task", _by_task, replace=True)
 
 
 def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return what a group offers.
+    """Return the names of a group's files.
 
     Args:
         group: ``task``, ``method``, ``protocol``, ``sim`` or ``experiment``.
@@ -125,10 +125,10 @@ _KEPT: dict[tuple[Any, ...], bytes] = {}
 
 
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
-    """Return what Hydra composes of prepared overrides, without Hydra's own section.
+    """Return Hydra's composition of prepared overrides, without its own section.
 
-    Hydra takes a tenth of a second. What differs in values only is composed once, and the values are set
-    afterwards, as Hydra does.
+    Hydra takes a tenth of a second. Configurations that differ only in values are composed once, and the
+    values are set afterwards, as Hydra does.
 
     Args:
         words: Prepared overrides.
@@ -155,7 +155,7 @@ def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictC
 
 
 def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
-    """Return what Hydra composes of prepared overrides, its own section included; see :func:`compose`."""
+    """Return Hydra's composition of prepared overrides, including its own section; see :func:`compose`."""
     folder = [] if config_dir is None else [f"file://{Path(config_dir).expanduser().resolve()}"]
     try:
         return hydra_app().compose_config(
@@ -170,7 +170,7 @@ def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = Non
 
 
 def hydra_app() -> Hydra:
-    """Return a Hydra application of plab's files, beside any other that there is."""
+    """Return a Hydra application for plab's files, independent of other applications."""
     version.setbase("1.3")
     return Hydra("plab", ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_folder()))))
 
@@ -212,8 +212,8 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Raise ConfigError for a missing folder, a file in it that is no text, and one with a name of plab's
-    own, which Hydra would ignore."""
+    """Raise ConfigError for a missing folder, files that are not text, and files with names of plab's own
+    files, which Hydra would ignore."""
     folder = Path(config_dir).expanduser()
     if not str(config_dir).strip() or not folder.is_dir():
         raise ConfigError(f"config folder '{config_dir}' does not exist")
@@ -228,10 +228,10 @@ def _check_config_dir(config_dir: str | Path) -> None:
 
 
 def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = True) -> Config:
-    """Turn what Hydra composed into a checked configuration.
+    """Convert a composed configuration to a checked one.
 
-    The chosen variant is merged over the task. The result keeps no other variant: what a run does not use is
-    no part of its configuration.
+    The chosen variant is merged over the task. The result contains only the chosen variant, because unused
+    values are not part of a run's configuration.
 
     Args:
         composed: The composed configuration, without Hydra's own section.
@@ -387,7 +387,7 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
     if isinstance(planner := method.get("planner"), DictConfig):
         method.planner = _typed_method(planner, f"{path}.planner")
     kind = family(str(method.family)).config_type(method.get("algorithm"))
-    # Below a root, so that what is wrong is named by its whole key.
+    # Below a root, so that error messages name the full key.
     root = OmegaConf.create({})
     OmegaConf.update(root, path, OmegaConf.structured(kind))
     OmegaConf.select(root, path).merge_with(method)
@@ -395,7 +395,7 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
 
 
 def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: bool) -> None:
-    """Refuse overrides of what goes with another variant, profile, protocol or task than the chosen ones."""
+    """Reject overrides of values that belong to another variant, profile, protocol or task."""
     task, method, variant, protocol = composed.task, composed.method, composed.variant, composed.protocol
     # By section: the choice that it goes with, and which of its entries counts, if any does.
     used: dict[str, tuple[str, str | None]] = {}
@@ -408,7 +408,7 @@ def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: 
                 own = "other" if "other" in tasks and task.name not in tasks else task.name
                 used[f"method.{table}.{chosen}."] = f"task={task.name}", own
     if alone or variant == RANDOM:
-        # Of the variants a random one uses that which gives what is not drawn, if any.
+        # A random variant uses the variant with the values that are not sampled, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant
         used |= dict.fromkeys(("task.variants.", "task.release.variants."), (f"variant={variant}", chosen))
     if variant != RANDOM:
@@ -456,7 +456,7 @@ def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
 
 
 def _choose_numbers(composed: DictConfig, overrides: Sequence[Override]) -> None:
-    """Put the release's numbers into the task if they are asked for, and forget them otherwise."""
+    """Apply the release's numbers to the task if requested, and remove the section."""
     if composed.protocol.numbers == "release":
         _refuse_undone(overrides, composed.task.release, "protocol.numbers=release", "task.release")
         composed.task.merge_with(composed.task.release)
@@ -480,7 +480,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
 
 
 def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return what a variant changes, of a task with all its variants; ConfigError if there is no such
+    """Return the changes of a variant, given a task with all its variants; ConfigError if there is no such
     variant."""
     if name not in task.variants:
         names = [*task.variants, *([RANDOM] if task.random else [])]

@@ -1,4 +1,4 @@
-"""Numbers of a task that every episode draws anew, from the ranges of its section ``randomize``.
+"""Task parameters sampled in every episode, from the ranges of the section ``randomize``.
 
 The section is a part of the task's structure, as variants are, with a range ``[low, high]`` in place of each
 number or list of numbers: ``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Bodies and
@@ -37,7 +37,7 @@ Values = dict[str, Any]
 
 
 def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the lowest and highest values of what is drawn, by dotted key, sorted.
+    """Return the lowest and highest values of sampled parameters, by dotted key, sorted.
 
     Raises:
         ConfigError: If a range is none, or its key is nothing that can be drawn.
@@ -85,8 +85,8 @@ def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
 
 
 def present_value(task: TaskConfig, key: str, path: str) -> Any:
-    """Return what a drawn key has in the task itself; ConfigError, which begins with ``path``, if the key is
-    nothing that can be drawn."""
+    """Return the value of a sampled key in the task itself; ConfigError, which begins with ``path``, if the
+    key is nothing that can be drawn."""
     group, *rest = key.split(".")
     if key in (NOISE, SCENE):
         return 0
@@ -120,7 +120,8 @@ def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Val
 
 
 def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
-    """Return a configuration whose task has some values; ``yaw`` and ``observation_noise`` are not in it."""
+    """Return a configuration with some values replaced in the task; ``yaw`` and ``observation_noise`` are not
+    in it."""
     task = copy.deepcopy(cfg.task)
     for key, value in values.items():
         *parts, last = key.split(".")
@@ -144,7 +145,7 @@ def yaws(task: TaskConfig, values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def with_own_materials(cfg: Config) -> Config:
-    """Return a configuration whose bodies have the material parameters that are drawn for them alone."""
+    """Return a configuration in which bodies with sampled material parameters have their own materials."""
     given = {}
     for key in ranges_of(cfg.task):
         group, *names, last = ("", *key.split("."))[-3:]
@@ -154,13 +155,13 @@ def with_own_materials(cfg: Config) -> Config:
 
 
 def extremes(cfg: Config) -> list[Config]:
-    """Return configurations with all lowest and with all highest values of what is drawn."""
+    """Return configurations with all lowest and with all highest values of sampled parameters."""
     bounds = ranges_of(cfg.task)
     return [with_values(cfg, {key: pair[side] for key, pair in bounds.items()}) for side in (0, 1)]
 
 
 def without_draws(cfg: Config) -> Config:
-    """Return a configuration whose episodes draw nothing."""
+    """Return a configuration without randomisation."""
     return replace(cfg, task=replace(cfg.task, randomize={})) if cfg.task.randomize else cfg
 
 

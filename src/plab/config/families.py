@@ -42,10 +42,10 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Rule:
-    """A learning algorithm or an update rule, of which a family may offer several.
+    """A learning algorithm or an update rule of a family.
 
     Attributes:
-        what: It; of which kind it is, is up to the family's runner.
+        what: Implementation; its type depends on the family's runner.
         config: Type of the section ``method``; None: the family's.
     """
 
@@ -55,14 +55,14 @@ class Rule:
 
 @dataclass(frozen=True)
 class Family:
-    """A family of methods: what they have in common, and who carries them out.
+    """A family of methods with a common runner.
 
     Attributes:
         label: Short description of its methods.
         config: Type of the section ``method``, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
-        columns: Columns of the results beside those that all methods have.
+        columns: Additional columns of the results.
         may_be_nan: Those of them with entries for which there is no number.
         ranking: Criterion of the best actions of a run: ``loss``, the lowest, or ``score``, the highest, and
             of several the one of lowest loss.
@@ -89,7 +89,7 @@ class Family:
     methods: Mapping[str, Appearance] = field(default_factory=dict)
 
     def config_type(self, rule: str | None = None) -> type:
-        """Return the type of the section ``method``, of a rule that has one of its own that."""
+        """Return the type of the section ``method``, which may depend on the rule."""
         own = self.rules.get(rule or "")
         return self.config if own is None or own.config is None else own.config
 
@@ -103,7 +103,7 @@ class Family:
 
 
 class _Registry(UserDict[str, Any]):
-    """Records by name, each imported when it is first asked for."""
+    """Records by name, imported on first access."""
 
     def __getitem__(self, name: str) -> Family:
         if isinstance(self.data[name], str):
@@ -143,8 +143,8 @@ def family(name: str) -> Family:
 
 
 def known_family(name: str) -> Family | None:
-    """Return the family of a name, None if its module has not been imported: readers of results can do
-    without, and no result file chooses what is imported."""
+    """Return the family of a name, or None if its module has not been imported: reading results does not
+    require it, and result files must not determine imports."""
     if name in FAMILIES or name.partition(":")[0] in sys.modules:
         try:
             return family(name)

@@ -68,7 +68,7 @@ THREADS = COUNT
 
 
 class Section:
-    """A part of the configuration; its fields' metadata say what values they may have, beside None."""
+    """A section of the configuration; the metadata of its fields define the valid values besides None."""
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""

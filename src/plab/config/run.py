@@ -20,7 +20,7 @@ from plab.scenes import CONTACTS, CONVENTIONS, DEVICES, MATERIAL_KEYS, PRECISION
 LOGGERS = ("none", "tensorboard", "wandb")
 
 SCORES = ("best", "last")
-"""Iterations whose score is that of the run: ``protocol.score``."""
+"""Iteration that gives the score of a run: ``protocol.score``."""
 
 
 @dataclass
@@ -35,8 +35,8 @@ class MethodConfig(ranges.Section):
             hard one.
         softness: Decay rate alpha of the soft contact [1 / domain unit].
         loss_weights: Weights of the step loss by the names of its terms; a term of weight 0 is left out.
-        loss_terms: Term of a weight's name: a key of ``plab.losses.TERMS``, or a class of your own as
-            ``module:Class``.
+        loss_terms: Implementation of a loss term: a key of ``plab.losses.TERMS``, or ``module:Class`` of a
+            custom class.
     """
 
     name: str = field(metadata=ranges.NAME)
@@ -213,7 +213,7 @@ SUFFIX = ".h5"
 """End of the names of result files."""
 
 RUN_ONLY_KEYS = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
-"""Keys that only ``plab run`` uses."""
+"""Keys used only by ``plab run``."""
 
 _NO_EFFECT = {
     "": RUN_ONLY_KEYS,
@@ -260,7 +260,7 @@ def config_hash(cfg: Config | Mapping[str, Any]) -> str:
 
 
 def _drop_places(node: Any) -> None:
-    """Remove the paths of files from a part of a configuration: their SHA-256 is what counts."""
+    """Remove file paths from a part of a configuration, because files are identified by their SHA-256."""
     for key, value in list(node.items()) if isinstance(node, dict) else ():
         if key in ("file", "model") and not isinstance(value, dict):
             del node[key]

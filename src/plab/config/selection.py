@@ -12,7 +12,7 @@ from plab.config.suite import SUITE_VARIANTS, group_names
 from plab.errors import ArgumentError, pick
 
 OBSERVATION_KEYS = ("observe_particles", "observe_target")
-"""Keys of a configuration that say which numbers an observation holds."""
+"""Configuration keys that determine the entries of observations."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     """
     if not words:
         return Selection()
-    # Imported here: without words nobody should have to wait for Hydra.
+    # Imported here, because Hydra is slow to import and not needed without overrides.
     from hydra.core.override_parser.types import OverrideType
 
     from plab.config.words import parse, prepared, swept
@@ -109,4 +109,4 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
 
 
 _OPEN = {"variant": r"random\d+", "seed": r"\d+"}
-"""Values that runs may have beside those that are listed."""
+"""Additional allowed values."""

@@ -15,7 +15,7 @@ SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 
 EXTENSION_TASKS = ("Gripper", "HandLift", "HandPinch", "HandPress", "HandRoll")
-"""Tasks beside the suite, with articulated models: in no table or default of the suite."""
+"""Extension tasks with articulated models, not included in tables and defaults of the suite."""
 
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
 """Methods that the paper compares, in its order."""
@@ -40,13 +40,13 @@ def conf_folder() -> Path:
 
 
 def group_names(group: str) -> list[str]:
-    """Return the names of plab's own files of a group, such as ``method``; none where there is no such."""
+    """Return the names of plab's own files of a group, such as ``method``; empty for unknown groups."""
     return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
 
 
 @functools.cache
 def shipped_file(group: str, name: str) -> Mapping[str, Any]:
-    """Return the content of one of plab's own files merged over its bases; nothing if there is none."""
+    """Return the content of one of plab's own files merged over its bases; empty if it does not exist."""
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}
@@ -68,5 +68,5 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 
 def suite_tasks() -> list[str]:
-    """Return the names of the suite's tasks, those of the files in ``conf/task`` beside the extension."""
+    """Return the names of the suite's tasks: the files in ``conf/task`` except extension tasks."""
     return [name for name in group_names("task") if name not in EXTENSION_TASKS]

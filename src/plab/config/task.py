@@ -91,7 +91,7 @@ class ManipulatorConfig(ranges.Section):
     minimal_gap: float | None = field(default=None, metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
+        """Raise :class:`ConfigError` for errors that :meth:`plab.scenes.Scene.validate` does not check."""
         super().check(path)
         ranges.vector(f"{path}.scale", self.scale, len(self.scale))
         for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
@@ -112,12 +112,12 @@ class ManipulatorConfig(ranges.Section):
 
 @dataclass
 class KinematicsConfig(ranges.Section):
-    """An articulated model: links that move by joint-space actions. Patterns are regular expressions of whole
-    names, of which the last that matches counts.
+    """An articulated model: links that move by joint-space actions. Patterns are regular expressions that
+    must match whole names; the last match applies.
 
     Attributes:
         model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
-        root: Body of the model whose frame is placed; the model's world if not given.
+        root: Body whose frame is placed in the domain; default: the model's world frame.
         size: Domain units per unit of length of the model.
         position: Place (x, y, z) of that frame's origin [domain units].
         rotation: Unit quaternion (w, x, y, z) from that frame's axes to the domain's; turns z up into y up if
@@ -231,11 +231,11 @@ class RandomConfig(ranges.Section):
     """Ranges that ``variant=random`` draws from.
 
     Attributes:
-        variant: Variant that gives what is not drawn; None where the task itself gives it.
-        shift: One displacement (x, y, z) for all bodies and all manipulators that move, except those with a
-            range of their own [domain units]. None leaves them where they are.
-        reach: Highest distance along an axis between a body and the target's body of the same name; what lies
-            farther is drawn again [domain units]. None sets no limit.
+        variant: Variant with the values that are not sampled; None where the task itself gives it.
+        shift: Common displacement (x, y, z) of all bodies and moving manipulators, except those with their
+            own range [domain units]. None leaves them where they are.
+        reach: Largest distance along an axis between a body and the target's body of the same name; samples
+            beyond it are rejected [domain units]. None sets no limit.
         ranges: Further drawn lists, by names of your choice.
     """
 
@@ -267,13 +267,14 @@ class TaskConfig(ranges.Section):
         gravity: Acceleration (x, y, z).
         bodies: Bodies of plasticine, by name.
         manipulators: Manipulators, by name, in the order of the action vector.
-        kinematics: An articulated model, whose links and actions come after the manipulators'; None without.
+        kinematics: An articulated model; its links and actions follow those of the manipulators; None
+            without.
         target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
         variants: By name: what each variant changes: a part of this very structure, merged over it.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
-        randomize: Ranges of what every episode of an environment draws, see :mod:`plab.config.draws`; empty
-            where all episodes are alike.
+        randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.draws`; empty: no
+            randomisation.
         cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
         stages: Targets, as ``target``, that environments ask for one after the other before ``target``; runs
             know ``target`` alone.
@@ -299,7 +300,7 @@ class TaskConfig(ranges.Section):
     kinematics: KinematicsConfig | None = None
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
+        """Raise :class:`ConfigError` for errors that :meth:`plab.scenes.Scene.validate` does not check."""
         super().check(path)
         for variant in self.variants:
             ranges.folder_name(f"{path}.variants", variant)
@@ -350,7 +351,7 @@ class TaskConfig(ranges.Section):
         """
         if self.kinematics is not None:
             self.kinematics.pin()
-        # A variant's file has a hash of its own, whatever it is merged over.
+        # The file of a variant has its own hash, independent of the task's.
         bodies = {name: vars(body) for name, body in self.bodies.items()}
         _pin({"bodies": bodies, "target": self.target, "variants": self.variants}, "task")
 

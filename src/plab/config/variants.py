@@ -1,8 +1,7 @@
 """Variants: the changes that make one particular start and target out of a task.
 
-Those of ``variant=random`` are drawn from the ranges in the task's section ``random``. What is drawn depends
-on the task and on ``seed_scene`` alone: not on the method's seed, the machine, the grid or the number of
-particles.
+Those of ``variant=random`` are drawn from the ranges in the task's section ``random``. Samples depend only on
+the task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ ATTEMPTS = 100
 """Maximum number of draws until a scene is valid."""
 
 DECIMALS = 4
-"""Drawn numbers are rounded to so many decimals, as the suite's own are."""
+"""Number of decimals of sampled numbers, as in the suite's files."""
 
 FIRST_TARGET_SEED = 1000
 """Drawn seeds of scripted targets are not below this, so that none is that of a variant in a YAML."""
@@ -35,10 +34,9 @@ _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
-    """Draw what a variant changes, a part of the task's structure as the entries of ``variants`` are.
-    ConfigError if the task, which has all its variants, does not say what to draw, or none of
-    :data:`ATTEMPTS` draws is valid; an OmegaConfBaseException if it lacks a value or has one of the wrong
-    type."""
+    """Sample the changes of a random variant, in the structure of the entries of ``variants``. ConfigError if
+    the task, which has all its variants, does not say what to draw, or none of :data:`ATTEMPTS` draws is
+    valid; an OmegaConfBaseException if it lacks a value or has one of the wrong type."""
     if not task.random:
         raise ConfigError(
             f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"
@@ -50,7 +48,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     if random.variant is not None:
         fixed = variant_changes(task, random.variant)
     base = cast(DictConfig, OmegaConf.merge(task, fixed))
-    base.variants = base.random = {}  # Attempts need not copy what none of them changes.
+    base.variants = base.random = {}  # Values that no attempt changes are not copied.
     if "seed" in base.target.keys():
         fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}}))
     rng = np.random.default_rng([seed_scene, _NUMBERS])
@@ -78,7 +76,7 @@ def _ranges(task: DictConfig) -> RandomConfig:
 
 
 def _target_seed(seed_scene: int) -> int:
-    # Not Generator.integers: NumPy keeps SeedSequence the same for good.
+    # Not Generator.integers: NumPy guarantees that SeedSequence does not change.
     (word,) = np.random.SeedSequence([seed_scene, _TARGET_SEED]).generate_state(1)
     return FIRST_TARGET_SEED + int(word) % (2**31 - FIRST_TARGET_SEED)
 
@@ -118,7 +116,7 @@ def _require_list(base: DictConfig, key: str, path: str) -> None:
     """Raise unless a key of the task is a list, perhaps one that only variants give."""
     node: Any = base
     for name in key.split("."):
-        # A missing value is a list, unless what is drawn does not fit in its place.
+        # A missing value is replaced by a list, unless the sampled value has another shape.
         if node is None:
             return
         names = [str(n) for n in node] if isinstance(node, DictConfig) else []
@@ -133,9 +131,9 @@ def _require_list(base: DictConfig, key: str, path: str) -> None:
 
 
 def _check(task: TaskConfig, random: RandomConfig) -> None:
-    """Raise what is wrong with a drawn task, short of simulating it."""
+    """Raise the errors of a sampled task, without simulating it."""
     task.check("task")
-    # The suite's grid and material, not the run's: they must not decide what is drawn.
+    # The suite's grid and material, because samples must not depend on the run's.
     scene = Scene(task.name, task.build_bodies(), **task.build_tools())
     scene.validate()
     check_target(scene, task.target)

@@ -23,7 +23,7 @@ from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ConfigError, pick
 
 FOLDERS = ("results_dir", "targets.source")
-"""Keys whose values are names of folders."""
+"""Keys with folder names as values."""
 
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
 """Infinity and NaN as YAML writes them."""
@@ -88,7 +88,7 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
         raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")
     if isinstance(value, Glob):
         found = value.filter(list(names))
-        # glob(*) is the suite; glob(Hand*) are tasks beside it.
+        # glob(*) is the suite; glob(Hand*) selects extension tasks.
         found = [name for name in found if name not in EXTENSION_TASKS] or found
     elif override.is_sweep_override():
         try:
@@ -103,7 +103,7 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
 
 
 def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None:
-    """Raise ConfigError for an override of an idle key or section, which has no effect on ``what``."""
+    """Raise ConfigError for an override of a key or section without effect on ``what``."""
     for override in parse(prepared(words)):
         if any(f"{override.key_or_group}.".startswith(f"{one}.") for one in idle):
             raise ConfigError(f"'{override.input_line}' has no effect on {what}: leave it out")

@@ -40,7 +40,7 @@ def load_actions(task: str, variant: str) -> np.ndarray | None:
 
 
 def known_actions(cfg: Config) -> np.ndarray | None:
-    """Return the best actions known for a configuration: its target's script, or what is recorded.
+    """Return the best known actions for a configuration: the script of its target, or recorded actions.
 
     Args:
         cfg: A configuration, also one that is not of the suite.

@@ -25,7 +25,7 @@ from plab.errors import PlabError
 __all__ = ["DatasetError", "Episode", "metadata_of", "read_episodes", "write_dataset"]
 
 VERSION = "0.5.4"
-"""Version of Minari whose format is written."""
+"""Version of Minari's format."""
 
 _ARRAYS = ("actions", "rewards", "terminations", "truncations")
 
@@ -36,7 +36,7 @@ class DatasetError(PlabError, ValueError):
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode of T steps, the last of which truncates it.
+    """An episode of T steps, truncated in the last step.
 
     Attributes:
         observations: Observations before each step and after the last, shape [T + 1, ...], or by key.
@@ -66,7 +66,7 @@ def write_dataset(
     Args:
         folder: Folder of datasets, such as ``MINARI_DATASETS_PATH`` names.
         name: Name of the dataset in it, such as ``plab/Move-v0``.
-        episodes: Its episodes, of which one is in memory at a time.
+        episodes: Episodes, held in memory one at a time.
         spaces: Spaces of observations and actions.
         env_spec: Environment that minari's ``recover_environment`` is to make.
         about: Further metadata.
@@ -131,13 +131,13 @@ def _write(group: h5py.Group, arrays: Mapping[str, Any]) -> None:
         if isinstance(values, Mapping):
             _write(group.create_group(name), values)
         else:
-            # Minari appends to what has no largest shape.
+            # Minari appends to datasets without a maximum shape.
             shape = (None, *values.shape[1:])
             group.create_dataset(name, data=values, maxshape=shape, chunks=values.shape, compression="gzip")
 
 
 def _described(space: Space[Any]) -> dict[str, Any]:
-    """Return what Minari's metadata say of a space."""
+    """Return the description of a space in Minari's metadata."""
     if isinstance(space, Dict):
         return {"type": "Dict", "subspaces": {key: _described(own) for key, own in space.items()}}
     assert isinstance(space, Box)

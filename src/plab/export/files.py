@@ -1,4 +1,4 @@
-"""The files: particles with what they have, surfaces of plasticine and manipulators, and the target.
+"""VTK and PLY files of particles with their fields, surfaces of plasticine and manipulators, and the target.
 
 VTK's own writers write them, through PyVista.
 """
@@ -26,7 +26,7 @@ from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
 
 Things = Callable[[int], Mapping[str, pv.PolyData]]
-"""Gives what there is at a step, by name."""
+"""Function that returns the meshes of a step, by name."""
 
 
 def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
@@ -79,7 +79,7 @@ def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
 def _frames(
     recording: RecordedRollout, every: int, things: Callable[[RecordedRollout], Things]
 ) -> Iterator[tuple[int, Mapping[str, pv.PolyData]]]:
-    """Yield steps and what there is at them, by name."""
+    """Yield steps and their meshes, by name."""
     last = len(recording.x) - 1
     at = things(recording)
     with show_progress("export", 0, last) as report:
@@ -89,7 +89,7 @@ def _frames(
 
 
 def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], path: Path) -> None:
-    """Write a mesh whose points have the colours of a palette, by their numbers."""
+    """Write a mesh with points coloured from a palette."""
     rgb = np.array([pv.Color(color).int_rgb for color in palette], np.uint8)
     mesh.triangulate().save(path, texture=rgb[np.asarray(numbers) % len(rgb)])
 
@@ -110,7 +110,7 @@ def _vtk_things(recording: RecordedRollout) -> Things:
 
 
 def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
-    """Return what the particles of a recording with motion have, at a step.
+    """Return the fields of the particles at a step of a recorded rollout with motion.
 
     Returns:
         ``body``, its number; ``displacement`` since the start [domain units]; ``velocity`` [domain units /
@@ -161,7 +161,7 @@ def _surfaces(recording: RecordedRollout) -> Things:
 
 
 def _merged(meshes: Sequence[pv.PolyData], numbers: Sequence[int], name: str) -> pv.PolyData:
-    """Return meshes as one, whose points say which of them they are of."""
+    """Merge meshes into one, with the number of the original mesh at each point."""
     for number, mesh in zip(numbers, meshes, strict=True):
         mesh[name] = np.full(mesh.n_points, number)
     return pv.merge(meshes, merge_points=False)

@@ -23,7 +23,7 @@ __all__ = ["JointActions", "LinkMotion", "rotation_vector"]
 
 
 class LinkMotion:
-    """Motion of the links in some environment steps, and the way back.
+    """Motion of the links in some environment steps, with its pullback.
 
     Attributes:
         twists: Actions of the simulator, shape [T, batch, component]; like the actions an array or a tensor.
@@ -31,14 +31,14 @@ class LinkMotion:
     """
 
     def __init__(self, given: list[Tensor], made: list[Tensor], as_array: bool) -> None:
-        """Keep what was ``given``, actions and joint positions, and what was ``made``, twists and joint
+        """Store the inputs ``given``, actions and joint positions, and the outputs ``made``, twists and joint
         positions."""
         self._given, self._made, self._as_array = given, made, as_array
         self.twists, self.joints = map(self._out, made)
 
     def pull_back(self, bar: Any, joints_bar: Any = None) -> tuple[Any, Any]:
-        """Return the derivatives by the actions, shape [T, batch, A], and by the joint positions before, from
-        those by the twists and by the joint positions after."""
+        """Return the derivatives with respect to the actions, shape [T, batch, A], and the initial joint
+        positions, from those with respect to the twists and the final joint positions."""
         bars = [torch.as_tensor(bar).to(self._made[0])]
         made = self._made[:1]
         if joints_bar is not None:

@@ -23,7 +23,7 @@ Matrix = tuple[tuple[float, ...], ...]
 """Homogeneous transform, 4 rows of 4 numbers."""
 
 IDENTITY_MATRIX = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
-"""The transform that changes nothing."""
+"""Identity transform."""
 
 BASE_JOINTS = {
     "base_x": (1.0, 0.0, 0.0),
@@ -38,7 +38,7 @@ BASE_JOINTS = {
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint and what it adds to its parent's frame: first ``offset``, then its own motion.
+    """A joint and its transform relative to the parent frame: first ``offset``, then its own motion.
 
     Attributes:
         name: Its name.

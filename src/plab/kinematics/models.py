@@ -34,12 +34,12 @@ def read_model(
 ) -> tuple[Chain, str]:
     """Read the tree below a body of a model: hinges and slides, and collision geometry as links.
 
-    Capsules, boxes, spheres and cylinders are taken as they are, meshes by a capsule or a box that encloses
-    them. Visual geometry, planes and free joints are left out.
+    Capsules, boxes, spheres and cylinders are used directly; meshes are replaced by an enclosing capsule or
+    box. Visual geometry, planes and free joints are left out.
 
     Args:
         model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
-        root: Body whose frame becomes the model's; the model's own world if None.
+        root: Body whose frame becomes the model's; default: the model's world frame.
         size: Domain units per unit of length of the model.
         omit: Patterns of names of geometry that is left out.
 
@@ -63,7 +63,8 @@ def read_model(
 
 
 def locate_model(model: str) -> str:
-    """Return where a model's file is, see :func:`plab.files.pinned`; one inside a package as it is."""
+    """Return the location of a model file, see :func:`plab.files.pinned`; files in packages are returned
+    unchanged."""
     inside_package = ":" in model and not os.path.exists(model)
     return model if inside_package else pinned(os.path.expanduser(model))[0]
 
@@ -162,6 +163,6 @@ def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None,
 
 
 def _rounded(values: Any) -> Any:
-    """Numbers as tuples, to 12 decimals: the last bits of what MuJoCo computes vary with its version."""
+    """Numbers as tuples, to 12 decimals, because the last bits vary between versions of MuJoCo."""
     rounded = (np.round(np.asarray(values, float), 12) + 0.0).tolist()
     return tuple(map(tuple, rounded)) if np.ndim(values) == 2 else tuple(rounded)

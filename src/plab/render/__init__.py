@@ -13,7 +13,7 @@ __all__ = ["Camera", "RenderError", "Renderer", "View", "fit_camera"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the renderer when it is asked for: all else works without PyVista."""
+    """Import the renderer on first access; everything else works without PyVista."""
     if name != "Renderer":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_graphics()

@@ -72,7 +72,7 @@ def scene_camera(
         seen.append(np.argwhere(target_mass > TARGET_MASS) * scene.dx)
     points = np.concatenate(seen)
     points[:, 1] = np.maximum(points[:, 1], 0.0)
-    # Shadows tell where in space things are.
+    # Shadows show positions in space.
     points = np.concatenate([points, points * [1.0, 0.0, 1.0]])
     return fit_camera(points, VIEWS.get(scene.name, DEFAULT_VIEW), size[0] / size[1])
 
@@ -82,7 +82,7 @@ _ROUNDS = 4  # of centring; each leaves a few percent of the error before it
 
 
 def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
-    """Return the camera whose pictures hold all points.
+    """Return a camera with all points in view.
 
     Args:
         points: Points in the picture [domain units], shape [point, 3].
@@ -99,7 +99,7 @@ def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
     for _ in range(_ROUNDS):
         across, toward = (points - look_at) @ screen.T, (points - look_at) @ back
         distance = (np.abs(across) / slope + toward[:, None]).max()
-        # Perspective makes near things larger: centre what is seen, not what is there.
+        # Perspective enlarges near objects, so the projected points are centred.
         seen = across / (distance - toward)[:, None]
         look_at = look_at + (seen.max(axis=0) + seen.min(axis=0)) / 2 * distance @ screen
     return Camera(tuple(look_at + _MARGIN * distance * back), tuple(look_at), FIELD_OF_VIEW)

@@ -16,7 +16,7 @@ _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
 
 
 class RenderError(PlabError, RuntimeError):
-    """A picture that cannot be drawn or written; the message is one line that says why and what would do."""
+    """A picture cannot be drawn or written; the one-line message states the reason and the remedy."""
 
 
 def require_graphics() -> None:
@@ -41,10 +41,10 @@ def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) ->
 
 @functools.cache
 def missing_graphics() -> str | None:
-    """Return what is missing for drawing, and how to install it; None if nothing is.
+    """Return the missing packages for rendering, and how to install them; None if nothing is.
 
-    On Linux, VTK is told to draw through EGL, which needs no screen, unless the environment variable
-    ``VTK_DEFAULT_OPENGL_WINDOW`` says otherwise.
+    On Linux, VTK renders through EGL, which needs no screen, unless the environment variable
+    ``VTK_DEFAULT_OPENGL_WINDOW`` is set.
     """
     try:
         require_packages("pictures need", {"pyvista": "PyVista", "PIL": "Pillow"}, "render")

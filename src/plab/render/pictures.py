@@ -31,7 +31,7 @@ STEPS_PER_SECOND = 20
 SUFFIXES = (".png", ".gif", ".mp4")
 """Suffixes of the files that can be written: a strip of pictures, or a film."""
 
-_HOLD = 1.0  # how long a film shows its last frame [s]
+_HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
 _SHEET_COLORS = 256
 _STRIP_FRAMES = 4  # of a task in the film strip
@@ -53,7 +53,7 @@ def check_output(path: Path) -> None:
     """Refuse a kind of file that cannot be written, before anything is computed.
 
     Raises:
-        RenderError: If the suffix is not supported, or what it needs is not installed.
+        RenderError: If the suffix is not supported, or a required package is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -122,7 +122,7 @@ def save_contact_sheet(
     """Write one picture of many tasks as PNG.
 
     Args:
-        rows: One row per task: its variants, of which start and target are shown.
+        rows: One row per task with the initial state and the target of each variant.
         path: File to write.
         size: Width and height of a cell [pixels]; start and target share it.
 
@@ -190,7 +190,7 @@ def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
-    """Make a file's folder; give a file beside it, which takes its place only if nothing goes wrong."""
+    """Create the folder of a file, and yield a temporary path that replaces the file on success."""
     fresh = path.with_name(f"{_UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -225,7 +225,7 @@ def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path:
 
 def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     frames = list(_frames(recording, renderer, every))
-    # One palette for all: what does not change then costs nothing.
+    # One palette for all frames, so that unchanged parts compress well.
     palette = _palette([frames[0], frames[len(frames) // 2], frames[-1]], _FILM_COLORS)
     images = [_with_palette(Image.fromarray(frame), palette) for frame in frames]
     duration = [1000 * every // STEPS_PER_SECOND] * (len(images) - 1) + [round(1000 * _HOLD)]
@@ -256,7 +256,7 @@ def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Itera
 
 
 def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
-    """Return a picture whose palette suits all pictures, each of shape [row, column, 3]."""
+    """Return a picture with a common palette for all pictures, each of shape [row, column, 3]."""
     pixels = np.concatenate([picture.reshape(-1, 3) for picture in pictures])
     seen, counts = np.unique(pixels, axis=0, return_counts=True)
     # By the root of how often a colour is seen: paper is everywhere, yet clay needs its shades, too.
@@ -280,18 +280,18 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
     """Draw runs of many configurations, see :func:`save_set`.
 
     Args:
-        wanted: For each configuration the folder of its pictures, which must not be there yet and appears
-            when it is complete; and what is to be drawn.
+        wanted: For each configuration the folder of its pictures, which must not exist and appears when it is
+            complete; and the pictures to draw.
         drawn: Is called when a folder is complete.
 
     Raises:
-        RenderError: If this computer cannot draw, a file cannot be written, or runs cannot be replayed; the
-            pictures of the others are there.
+        RenderError: If rendering is not possible, a file cannot be written, or runs cannot be replayed; all
+            other pictures are written.
     """
     require_graphics()
     troubles: list[str] = []
     for place in {folder.parent for folder in wanted}:
-        # What a process that was killed has left of pictures.
+        # Leftover pictures of killed processes.
         for folder in place.glob(f"{_UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:

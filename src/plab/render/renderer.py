@@ -40,13 +40,13 @@ _METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25
 _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "culling": "back"}
 _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
 _SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
-_TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
+_TARGET_SMOOTHING = (60, 0.02)  # targets come from samples without known initial positions
 _NEAR = 0.01  # distance from the plasticine's surface at which the ghost vanishes [domain units]
-_MIN_OPACITY = 0.45  # opacity of a manipulator that hides what it does
+_MIN_OPACITY = 0.45  # opacity of a manipulator that occludes plasticine
 _OCCLUSION_RANGE = (
     0.5,
     0.8,
-)  # share of itself with which it hides plasticine: it begins to be translucent, and is
+)  # fraction of a manipulator in front of plasticine at which it begins to be translucent, and is fully so
 _SHADOW = 0.6  # strength of the shadows on the floor
 _LINE = 1.3  # width of the floor's lines [pixels]
 _LINE_OPACITY = 0.16
@@ -55,7 +55,7 @@ _LINE_OPACITY = 0.16
 class Renderer:
     """Draws pictures of one scene.
 
-    A window, which nobody sees, stays open from one picture to the next; only what has moved is changed.
+    An off-screen window is reused between pictures; only moved objects are updated.
 
     Attributes:
         size: Width and height of the pictures [pixels].
@@ -104,7 +104,7 @@ class Renderer:
     def frame(self, x: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """Draw a state, with the target's ghost in it, also inside plasticine.
 
-        Manipulators let be seen what they do to plasticine behind them.
+        Manipulators become translucent in front of plasticine.
 
         Args:
             x: Particle positions [domain units], shape [particle, 3].
@@ -194,7 +194,7 @@ class Renderer:
         plotter = pv.Plotter(off_screen=True, lighting="none", window_size=list(self.size))
         plotter.set_background(PAPER)
         plotter.enable_anti_aliasing("msaa", multi_samples=8)
-        # VTK's order-independent pass for what is translucent knows no anti-aliasing.
+        # VTK's order-independent transparency has no anti-aliasing.
         plotter.renderer.SetUseOIT(False)
         camera = plotter.camera
         camera.position, camera.focal_point = self.camera.position, self.camera.target
@@ -239,7 +239,7 @@ class PlasticineSurface:
         self.actors = [plotter.add_mesh(mesh, scalars="color", rgb=True, smooth_shading=True, **_CLAY)]
 
     def set_shape(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
-        """Give it another shape, in the light that there is."""
+        """Set the shape, with ambient light."""
         if mesh.n_points:
             light = ambient.at(mesh.points, mesh.point_normals)[:, None]
             # Light that goes back and forth between walls of clay takes on more of their colour.
@@ -275,8 +275,8 @@ class Rigid:
         self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
 
     def make_translucent(self, x: np.ndarray, camera: Camera) -> None:
-        """Let it be seen through where it hides plasticine that it is at work on: particles at positions
-        [domain units], shape [particle, 3]."""
+        """Make the manipulator translucent if it occludes particles at positions [domain units], shape
+        [particle, 3]."""
         low, high = _OCCLUSION_RANGE
         share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
         for actor in self.actors:
@@ -297,8 +297,8 @@ class Target:
     def __init__(
         self, plotter: pv.Plotter, inside: vtkRenderer, scene: Scene, mass: np.ndarray, camera: Camera
     ) -> None:
-        """Add the target with a mass tensor, shape [n, n, n], to a window; ``inside`` is its layer for what
-        is seen inside plasticine."""
+        """Add the target with a mass tensor, shape [n, n, n], to a window; ``inside`` is the layer of objects
+        inside plasticine."""
         self.mesh = target_mesh(scene, mass)
         self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
         self.solid = PlasticineSurface(plotter, self.mesh.copy(), TARGET_COLOR)
@@ -318,7 +318,8 @@ class Target:
         self.actors = [*self.ghost, *self.solid.actors]
 
     def hide_covered_parts(self, bodies: Sequence[Field]) -> None:
-        """Hide the ghost where it runs along the plasticine's surface, not where it crosses it."""
+        """Hide the target's surface where it runs along the plasticine's surface, but not where they
+        cross."""
 
         def density(points: np.ndarray) -> np.ndarray:
             return np.sum([field.at(points) for field in bodies], axis=0)
@@ -331,7 +332,7 @@ class Target:
         slope = np.stack([density(points + step) - density(points - step) for step in steps], axis=1)
         length = np.linalg.norm(slope, axis=1)
         cosine = np.abs(np.sum(slope * normals, axis=1)) / np.maximum(length, 1e-6)
-        # The plasticine in front hides what of these is inside.
+        # Plasticine in front occludes their inner parts.
         crossing = np.where(here < 0.9, np.clip((0.9 - cosine) / 0.2, 0.0, 1.0), 0.0)
         for bubble, share in zip(self._bubbles, (np.maximum(outside, crossing), inside), strict=True):
             bubble["color"][:, 3] = self._alpha * share

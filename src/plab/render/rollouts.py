@@ -37,7 +37,7 @@ class RecordedRollout:
         target_mass: Mass tensor of the target, shape [n, n, n]; None if it cannot be made here.
         x: Particle positions [domain units] at the start and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
-        scores: Scores of these states, shape [T + 1]; None without a target, or where they are not asked for.
+        scores: Scores of these states, shape [T + 1]; None without a target, or if not requested.
         v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
         F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
@@ -59,7 +59,7 @@ class RecordedRollout:
 
 
 def result(path: Path) -> tuple[Config, np.ndarray]:
-    """Return what :func:`stored` does, for this computer: on the CPU where there is no CUDA device."""
+    """As :func:`stored`, but on the CPU if this computer has no CUDA device."""
     cfg, actions = stored(path)
     if cfg.sim.device == "cuda" and not cuda_devices():
         print_once("the run used CUDA, which this computer has not: replaying it on the CPU")
@@ -148,7 +148,7 @@ def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = Tr
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """Run actions as :func:`record` does, and keep velocities and deformation gradients.
 
-    A target that cannot be made here, such as one whose file is elsewhere, is left out, and a line says so.
+    A target that cannot be generated, for example because its file is missing, is left out, with a message.
     """
     try:
         (recording,) = _recordings([cfg], Problem([cfg]), actions[None], motion=True)
@@ -215,12 +215,12 @@ def _recordings(
 
 
 def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str, np.ndarray]:
-    """Return what a recording has of each state, of one environment of the batch."""
+    """Return the arrays of one environment of the batch for each state."""
     names = ("x", "poses", *(("v", "F") if motion else ()))
     return {name: np.stack([getattr(state, name)[number] for state in states]) for name in names}
 
 
 @functools.cache
 def print_once(message: str) -> None:
-    """Print a message, once however many runs it is true of."""
+    """Print a message once, even if it applies to several runs."""
     tell(message)

@@ -1,6 +1,6 @@
-"""Soft shadows, on the floor and where surfaces meet, and what hides what. Plain NumPy.
+"""Soft shadows, ambient occlusion, and visibility of bodies. Plain NumPy.
 
-Whatever throws a shadow is a cloud of points, each of which covers a small area.
+Objects that cast shadows are point clouds; each point covers a small area.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ FLOOR_EDGE = 1.8
 
 _PIXELS = 192  # of the floor, per axis
 _LAYER_HEIGHTS = np.array([0.0, 0.06, 0.18, 0.45])
-_LAYER_BLURS = 0.008 + 0.16 * _LAYER_HEIGHTS  # the light is not a point: high things throw soft shadows
+_LAYER_BLURS = 0.008 + 0.16 * _LAYER_HEIGHTS  # extended light: high objects cast soft shadows
 
 _CELL = 0.02  # of the grid of covered space
 _BLUR = 1.1  # in cells
 _CELLS_AROUND = 5
 _OPACITY = 1.5
 _SAMPLE_DISTANCE = 0.03  # distance from a surface at which its light is measured
-_FLAT_OCCLUSION = 0.06  # what a flat surface covers of its own view
+_FLAT_OCCLUSION = 0.06  # occlusion of a flat surface by itself
 _STRENGTH = 1.1
-_VIEW_CELL = 0.02  # of the picture in which things hide each other [domain units where it looks at]
+_VIEW_CELL = 0.02  # of the visibility picture [domain units at the camera's target]
 _CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
 _DARKEST = 0.25
 
@@ -66,7 +66,8 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
         height = np.maximum(cloud.points[:, 1], 0.0)
         ground = cloud.points[:, ::2] - height[:, None] * light[::2] / light[1]
         column, row = ((ground - FLOOR_LOW) / pixel).astype(np.int64).clip(0, _PIXELS - 1).T
-        # Shared out between the layers above and below, so that nothing jumps when a thing is lifted.
+        # Distributed over the layers above and below, so that shadows change continuously when an object is
+        # lifted.
         place = np.interp(height, _LAYER_HEIGHTS, np.arange(len(_LAYER_HEIGHTS)))
         for number, layer in enumerate(layers):
             share = np.maximum(1.0 - np.abs(place - number), 0.0)

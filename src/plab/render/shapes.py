@@ -86,7 +86,7 @@ def transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _capsule(low: float, high: float, radius: float) -> np.ndarray:
-    """Profile (distance from the y axis, y) of a capsule whose axis goes from y = low to high."""
+    """Return the profile (distance from the y axis, y) of a capsule with its axis from y = low to high."""
     angle = np.linspace(-math.pi / 2, math.pi / 2, _ARC + 2)  # an even number: two next to the equator
     ends = np.where(angle < 0, low, high)
     return np.stack([radius * np.cos(angle), ends + radius * np.sin(angle)], axis=1)

@@ -1,4 +1,4 @@
-"""Smooth surfaces of plasticine from its particles: scalar fields whose level set is the surface.
+"""Smooth surfaces of plasticine as level sets of scalar fields of its particles.
 
 A body's particles are drawn at random, so their plain density is grainy and its level set lumpy. Each
 particle therefore gets a weight, chosen once such that the weighted density of the undeformed body is its
@@ -61,8 +61,8 @@ class BodySurface:
     """The surface of one body as its particles move."""
 
     def __init__(self, body: Body, rest: np.ndarray) -> None:
-        """Weigh the body's particles, whose positions at t = 0 are given [domain units], shape [particle,
-        3]."""
+        """Compute the weights of a body's particles from their initial positions [domain units], shape
+        [particle, 3]."""
         self._spacing = (body.volume / body.particles) ** (1 / 3)
         self._weights = np.full(len(rest), CELL**-3)
         grid = _Grid(rest, self._spacing)
@@ -70,14 +70,13 @@ class BodySurface:
         for _ in range(WEIGHT_ITERATIONS):
             ratio = wanted / np.maximum(grid.density(rest, self._weights), 1e-3)
             self._weights *= map_coordinates(ratio, grid.coordinates(rest).T, order=1)
-        # Half of the density inside would enclose too little: the kernel rounds off what is convex.
+        # Half of the inner density would enclose too little volume, because the kernel rounds convex parts.
         fine = zoom(wanted, 2, order=1, grid_mode=True, mode="nearest")
         nodes = round(8 * body.volume / grid.spacing**3)
         self._level = float(np.partition(fine, -nodes, axis=None)[-nodes])
 
     def field(self, x: np.ndarray) -> Field:
-        """Return the field whose level set is the surface of particles at positions [domain units], shape
-        [particle, 3]."""
+        """Return the scalar field of particles at positions [domain units], shape [particle, 3]."""
         grid = _Grid(x, self._spacing)
         return Field(grid.density(x, self._weights), grid.origin, grid.spacing, self._level)
 
@@ -95,7 +94,7 @@ def body_surfaces(scene: Scene) -> list[BodySurface]:
 
 
 def target_field(scene: Scene, mass: np.ndarray) -> Field:
-    """Return the field whose level set is the surface of a target.
+    """Return the scalar field of a target.
 
     The level is a fraction of the density nearby, because bodies may be of different density.
 

@@ -1,4 +1,4 @@
-"""Run time against error, and float32 against float64: what the benchmarks of accuracy measured."""
+"""Figures and tables of the accuracy benchmarks: run time against error, and float32 against float64."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def diagrams(table: pd.DataFrame) -> list[Drawing]:
     """Draw run time against each kind of error, a figure per task and per axis that was varied.
 
     Args:
-        table: As :func:`work_precision` takes it, or the rows as they are before they are written.
+        table: Argument as for :func:`work_precision`, or rows not yet written.
     """
     table = table.astype(dict.fromkeys(("ms_per_step", *_ERRORS), float))
     out = []
@@ -64,7 +64,7 @@ def diagrams(table: pd.DataFrame) -> list[Drawing]:
 
 
 def _diagram(name: str, table: pd.DataFrame, panels: Sequence[tuple[str, str, str]], rows: int) -> Drawing:
-    """Draw panels in so many rows, each of a task, a column of errors and a contact model."""
+    """Draw panels in a number of rows, each for a task, a column of errors and a contact model."""
     varied = table["axis"].iloc[0]
     numbers = {"substeps": "substeps per step", "grid": "grid nodes per axis"}[varied]
     timed = bool(table["ms_per_step"].notna().any())
@@ -100,7 +100,7 @@ def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str)
             if number not in named:
                 panel.annotate(str(number), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
         named.update(stable[varied])
-        # Runs that broke off have no error: they are at the upper edge, whatever the scale.
+        # Diverged runs have no error; they are drawn at the upper edge.
         above: Any = panel.get_xaxis_transform()
         small: dict[str, Any] = {"fontsize": 5, "textcoords": "offset points", "xycoords": above}
         for x, number in rows.loc[rows["outcome"] != "stable", [cost, varied]].itertuples(index=False):

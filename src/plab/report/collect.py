@@ -41,7 +41,7 @@ _IGNORED_KEYS = (
 
 
 class MixedRunsError(PlabError, ValueError):
-    """Runs that do not belong into one mean; the message is one line that says how to choose."""
+    """Runs that must not be averaged; the one-line message names the override that selects among them."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Setting:
     Attributes:
         key: Dotted key of the setting.
         value: Value of the setting.
-        whose: Methods, with tasks and variants as far as needed, whose runs have it; empty if all have.
+        whose: Methods with this setting, with tasks and variants as far as needed; empty for all methods.
     """
 
     key: str
@@ -68,13 +68,13 @@ class Runs:
 
     Attributes:
         table: Table of :func:`plab.results.load`, a row per run.
-        tasks: Tasks asked for.
-        variants: Variants asked for.
-        methods: Methods asked for, in the order of tables.
-        seeds: Seeds asked for.
-        unfinished: Number of runs asked for that are not finished, hence not in ``table``.
+        tasks: Requested tasks.
+        variants: Requested variants.
+        methods: Requested methods, in the order of tables.
+        seeds: Requested seeds.
+        unfinished: Number of requested runs that are not finished and not in ``table``.
         under_way: Number of runs among them that a process computes at this moment.
-        others: Number of finished runs that were not asked for.
+        others: Number of finished runs that were not requested.
         set_aside: Number of finished runs with more changes to plab's own settings than others of the same
             task and method.
         unusual: Settings other than plab's own.
@@ -115,7 +115,7 @@ class Runs:
 
     @property
     def expected(self) -> int:
-        """Number of runs of all tasks, variants and seeds asked for, by the methods that have runs."""
+        """Number of requested runs of all tasks, variants and seeds, for methods that have runs."""
         return len(self.tasks) * len(self.variants) * len(self.seeds) * len(self.present)
 
     def left_out(self) -> list[str]:
@@ -154,7 +154,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         source: Folder of results, archive, or several of them.
         chosen: Choice of runs; where it leaves something open: the suite's tasks and variants, the paper's
             methods and seeds, and further methods and seeds that the results have.
-        split: Setting whose values are treated as methods of their own: a dotted key, ``folder`` or ``seed``;
+        split: Setting whose values are treated as separate methods: a dotted key, ``folder`` or ``seed``;
             none if empty.
 
     Raises:
@@ -162,8 +162,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         plab.errors.ArgumentError: If there are runs of several protocols, or no runs differ in
             ``split``.
         plab.config.ConfigError: If no run can be of the choice.
-        plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
-            can be read.
+        plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
@@ -294,7 +293,7 @@ def _by_number(text: str) -> tuple[float, str]:
 
 
 def _refuse_mixed(found: Sequence[Row]) -> None:
-    """Refuse runs of one configuration, or of one task and method, that differ in what matters."""
+    """Reject runs of one configuration, or of one task and method, with different settings."""
     groups: dict[tuple[str, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in found:
         groups[row.values["task"], row.values["method"]][row.values["variant"]].append(row)
@@ -382,7 +381,8 @@ def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Set
 
 
 def _described(own: Sequence[Row], every: Sequence[Row]) -> str:
-    """Return the shortest description that tells some runs from all others; empty where they are all."""
+    """Return the shortest description that distinguishes some runs from all others; empty if there are no
+    others."""
     for names in ((), ("method",), ("method", "task"), ("method", "task", "variant")):
         kinds = {tuple(row.values[name] for name in names) for row in own}
         if sum(tuple(row.values[name] for name in names) in kinds for row in every) == len(own):
@@ -396,7 +396,7 @@ def _described(own: Sequence[Row], every: Sequence[Row]) -> str:
 
 
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run's configuration that are not those of plab's own files, by dotted key."""
+    """Return the settings of a run that differ from plab's own files, by dotted key."""
     variants = config["task"].get("variants") or {}
     by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
@@ -428,7 +428,7 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
 
 @functools.cache
 def _default_settings(method: str, protocol: str) -> dict[str, Any]:
-    """Return method, protocol and sim of plab's files, without the method where plab does not know it."""
+    """Return method, protocol and sim of plab's files, without the method if it is not plab's."""
     # Composing needs Hydra.
     from plab.config import choices, load_config
     from plab.results import config_dict

@@ -41,7 +41,7 @@ _POINTS = 60
 
 
 def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
-    """Return the rows of the runs that are what is asked for, by method."""
+    """Return the rows of the requested runs, by method."""
     found: dict[str, list[Rows]] = defaultdict(list)
     for names, table in series:
         if all(names[key] == value for key, value in which.items()):
@@ -182,7 +182,7 @@ def _tasks_with_runs(runs: Runs) -> tuple[list[str], list[str]]:
 
 
 def _finish(figure: Figure, absent: Sequence[str]) -> None:
-    """Add the legend, and say which tasks have no panel."""
+    """Add the legend, and a note on tasks without panel."""
     legend(figure)
     if absent:
         text = textwrap.fill(f"no runs: {', '.join(absent)}", int(figure.get_figwidth() * 20))
@@ -193,8 +193,8 @@ def _finish(figure: Figure, absent: Sequence[str]) -> None:
 
 
 def rl_scores(runs: Runs) -> list[Drawing]:
-    """Return the final scores of the RL methods per task that they have runs of, beside the paper's and with
-    their limit; nothing where that would be a single bar."""
+    """Return the final scores of the RL methods per task, beside the paper's and with the demonstrations'
+    limit; none for single bars."""
     own = runs.table[[method(name).kind == RL for name in runs.table["method"]]]
     tasks = [task for task in ordered_tasks(runs.tasks) if task in set(own["task"])]
     methods = [name for name in runs.methods if name in set(own["method"])]

@@ -52,7 +52,7 @@ class Drawing:
     Attributes:
         name: Name of its files.
         figure: The figure.
-        notes: Sentences on what it shows.
+        notes: Notes on the figure.
         numbers: Numbers that it shows, if they are few.
     """
 
@@ -96,7 +96,7 @@ def draw_band(
     Args:
         axes: Axes to draw on.
         drawn: Mean and spread.
-        name: Name of the method, which has a colour and a line style of its own.
+        name: Name of the method, which determines colour and line style.
         ceiling: The spread is drawn from zero to this.
         colour: Another colour.
         label: Another label.
@@ -129,7 +129,7 @@ def _tick(value: float, _position: int) -> str:
 
 
 def legend(figure: Figure, columns: int | None = None) -> None:
-    """Put one legend for all axes above them, in as many columns as there is room for, or as asked for."""
+    """Add a common legend above all axes, in as many columns as fit, or in the given number."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -160,7 +160,7 @@ def fix_layout(figure: Figure) -> None:
 
 
 def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -> None:
-    """Write each figure as PDF and PNG, and beside them what they were made from, as JSON.
+    """Write each figure as PDF and PNG, with a JSON file of its data and provenance.
 
     Args:
         drawings: The figures.

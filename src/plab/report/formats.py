@@ -16,7 +16,7 @@ import pandas as pd
 from plab.report.statistics import Summary
 
 NOTHING = "\N{EN DASH}"
-"""Stands where there is no number."""
+"""Placeholder for missing numbers."""
 
 MINUS = "\N{MINUS SIGN}"
 """Sign of negative numbers."""
@@ -33,7 +33,7 @@ class Table:
         cells: Text of the table.
         data: The same as numbers with all digits, a row per number or group of numbers: the CSV file.
         bold: Mask of bold cells, of the shape of ``cells``; None if none is.
-        notes: Sentences on what the table says and how it was made.
+        notes: Notes on the contents and the provenance of the table.
         long: True if it may be longer than a page.
     """
 
@@ -56,7 +56,7 @@ def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
     """Write a number with the sign of a minus, not that of a hyphen; a dash if there is none."""
     if math.isnan(value):
         return NOTHING
-    # Without the minus of what is rounded to zero.
+    # Without a minus sign for values rounded to zero.
     rounded = round(value, decimals) + 0.0
     text = f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
     return text.replace("-", MINUS)
@@ -80,7 +80,7 @@ def mean_and_std(summary: Summary, decimals: int = 2) -> str:
 
 
 def write_table(table: Table, folder: Path, origin: Mapping[str, Any]) -> None:
-    """Write LaTeX, Markdown and CSV, and beside them what they were made from, as JSON.
+    """Write LaTeX, Markdown and CSV files, with a JSON file of the provenance.
 
     Args:
         table: The table.
@@ -127,7 +127,7 @@ _LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"}
 
 
 _COLUMN = {"remark": r"p{0.55\linewidth}"}
-"""Columns of running text; all others are as wide as they need."""
+"""Columns of running text; all others have their natural width."""
 
 
 def _latex_text(text: str) -> str:

@@ -25,8 +25,8 @@ class Shown:
         task: Name of the task.
         variant: Name of the variant.
         runs: Best run of each method: its row of the table of runs.
-        drawn: Methods whose run has a picture.
-        films: Methods whose run has a film.
+        drawn: Methods with a picture.
+        films: Methods with a film.
     """
 
     task: str
@@ -135,7 +135,7 @@ def missing_pictures(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, 
 
 
 def remove_earlier(shown: Sequence[Shown], out: Path) -> None:
-    """Remove pictures of runs that are no longer the best, where there are those of the best."""
+    """Remove pictures of runs that have been surpassed, once those of the best runs exist."""
     for one in shown:
         current = out / FOLDER / one.folder
         if current.is_dir():

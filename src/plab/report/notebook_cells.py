@@ -95,14 +95,14 @@ def show_figure(drawing: Drawing | None) -> None:
 
 
 def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
-    """Return the rows of a benchmark, or say what makes its file.
+    """Return the rows of a benchmark, or show the command that generates its file.
 
     Args:
-        folder: Folder of the benchmarks' files; ``example`` is that which comes with plab.
+        folder: Folder of the benchmarks' files; ``example`` is the bundled one.
         which: The benchmark.
 
     Returns:
-        Its rows; None where the file is missing or not what it should be.
+        Its rows; None if the file is missing or invalid.
     """
     try:
         return measured(measurements(folder) / which.file, which)

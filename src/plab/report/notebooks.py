@@ -47,13 +47,13 @@ def execute(
         names: Names among :data:`NOTEBOOKS`.
         parameters: Values for the names in the notebooks' cell ``parameters``.
         out: Folder to write to.
-        report: Is told how many are done, and the last one's name.
+        report: Callback with the number of finished notebooks, and the name of the last one.
 
     Returns:
         The pages.
 
     Raises:
-        plab.results.ResultsError: If a notebook breaks off.
+        plab.results.ResultsError: If a notebook fails.
     """
     require_notebooks()
     import nbformat
@@ -86,16 +86,16 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
     )
     client.create_kernel_manager()
     if client.km is not None and os.name == "posix":
-        # Files of the user's own; what goes over TCP others on the computer can read.
+        # Sockets as files of the user, because others on the computer could read TCP connections.
         client.km.transport = "ipc"
     try:
-        # What a kernel itself says is about Jupyter; what cells say is in the notebook.
+        # Output of the kernel process concerns Jupyter; output of cells is in the notebook.
         client.execute(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except CellExecutionError as error:
         raise ResultsError(f"notebook {name} broke off: {error.ename}: {error.evalue}") from error
     for cell in notebook.cells:
         if cell.cell_type == "code":
-            # Everything that is to be seen is displayed; what is printed is libraries' talk.
+            # Results are displayed explicitly; printed text comes from libraries.
             cell.outputs = [output for output in cell.outputs if output.output_type != "stream"]
     return notebook
 

@@ -1,9 +1,9 @@
 """Static page of results: overview; curves, pictures, films and runs of each configuration.
 
 The page needs no server and no network. ``index.html`` holds style, script and the overview. The curves of a
-configuration are in a script of its own below ``data/``, loaded on demand: browsers let a page from the file
-system load scripts, but no data. ``data/state.js`` names the current version, so that an open page notices
-that it has been written again.
+configuration are in a script below ``data/``, loaded on demand, because pages opened as files can load
+scripts but not data. ``data/state.js`` names the current version, so that an open page notices that it has
+been written again.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "co
 
 
 class Page:
-    """Page of some runs: numbers are computed once, pictures join as they are drawn.
+    """Page of some runs: numbers are computed once, pictures are added when they are rendered.
 
     Attributes:
         shown: Configurations and the runs of them that pictures show.
@@ -127,8 +127,8 @@ class Page:
         """Write ``index.html`` with the pictures that there are.
 
         Args:
-            drawing: True while pictures are being drawn. Then, or while runs are under way, the page loads
-                itself again when it has been written anew.
+            drawing: True while pictures are being drawn. Then, or while runs are in progress, the page
+                reloads itself after updates.
         """
         pictures = {one.name: present(one, self._out) for one in self.shown}
         configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
@@ -222,8 +222,8 @@ def _gallery(shown: Sequence[Shown]) -> list[dict[str, Any]]:
 
 
 def _aggregates(runs: Runs) -> Mapping[str, Any]:
-    """Return interquartile means, performance profiles and probabilities of improvement, each with the ends
-    of its interval; and what they are taken over."""
+    """Return interquartile means, performance profiles and probabilities of improvement, each with its
+    interval, and a note on the runs included."""
     shared = shared_strata(runs)
     strata = shared.strata
     thresholds = np.linspace(0.0, 1.0, _THRESHOLDS)

@@ -1,4 +1,4 @@
-"""Numbers that stand beside the runs: the paper's tables, and the files of the benchmarks."""
+"""Reference numbers: the paper's tables, and benchmark files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def paper_table(name: str) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark whose file is read.
+    """A benchmark with a CSV file.
 
     Attributes:
         file: Name that its file has in a folder of benchmarks.
@@ -71,10 +71,11 @@ PRECISION = Benchmark(
 
 
 def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
-    """Read a benchmark's file; lines that begin with ``#`` say how it was made.
+    """Read a benchmark file; lines that begin with ``#`` describe its origin.
 
     Raises:
-        plab.results.ResultsError: If it is missing or not what it should be; the message says what makes it.
+        plab.results.ResultsError: If it is missing or invalid; the message names the command that generates
+            it.
     """
     advice = f"`{benchmark.command.format(file=path, folder=path.parent)}` makes it"
     try:

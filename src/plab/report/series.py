@@ -23,7 +23,7 @@ BUDGETS = (1e3, 1e4, 1e5, 1e6)
 """Budgets at which methods are compared [environment steps]."""
 
 Rows = Mapping[str, np.ndarray]
-"""Columns of a run's iterations: not a pandas table, of which thousands take long to make."""
+"""Columns of a run's iterations, as arrays, because thousands of pandas tables are slow to create."""
 
 Series = Sequence[tuple[dict[str, str], Rows]]
 """Task, variant, method and seed of each run, and its iterations."""

@@ -58,7 +58,7 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
 
     The difference is the mean over the strata of the differences of their means. Its interval is Welch's: the
     variance of a stratum's mean is estimated within the stratum, on both sides, degrees of freedom are
-    Welch's and Satterthwaite's. What the paper rounds to two decimals is not accounted for.
+    Welch's and Satterthwaite's. The rounding of the paper's values to two decimals is neglected.
 
     Args:
         ours: Mean, population standard deviation and count of each stratum.
@@ -81,7 +81,7 @@ def stratified_mean(strata: Sequence[Summary]) -> Interval:
 
 
 def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
-    """Put an interval around a mean over ``count`` strata, of which all ``sides`` are parts."""
+    """Return a mean over ``count`` strata with its interval, from the contributions ``sides``."""
     if any(side.count < 2 for side in sides):
         return Interval(value, float("nan"), float("nan"))
     # The variance of a mean, from a population's standard deviation.
@@ -110,7 +110,7 @@ def interquartile_mean(strata: Strata) -> Interval:
     """Return the mean of the middle half of all scores, with its percentile interval."""
 
     def middle(samples: np.ndarray) -> np.ndarray:
-        # As SciPy's trim_mean, whose module would take longer to import than all tables to make.
+        # As SciPy's trim_mean, which takes longer to import than all tables take to compute.
         count = samples.shape[1]
         cut = count // 4
         return np.sort(samples, axis=1)[:, cut : count - cut].mean(axis=1)
@@ -119,7 +119,7 @@ def interquartile_mean(strata: Strata) -> Interval:
 
 
 def performance_profile(strata: Strata, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the share of runs whose score exceeds each threshold.
+    """Return the fraction of runs with a score above each threshold.
 
     Args:
         strata: Scores.
@@ -181,9 +181,9 @@ class Shared:
     """The scores that methods are compared by, all together.
 
     Attributes:
-        keys: Task and variant of the configurations of which every method shown has runs.
+        keys: Task and variant of the configurations for which all methods shown have runs.
         strata: Scores of each of them, by method.
-        notes: Sentences on what is shown and what is not.
+        notes: Notes on included and missing runs.
     """
 
     keys: list[tuple[str, str]]
@@ -217,11 +217,11 @@ def shared_strata(runs: Runs) -> Shared:
 def common_strata(
     scores: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
 ) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
-    """Return configurations of which several methods have runs, and the scores of these methods.
+    """Return configurations with runs of several methods, and the scores of these methods.
 
     Methods are left out one by one, each time the one without which most configurations are shared, of
-    several the one with the fewest. Of what is left each time, the methods and configurations are taken that
-    make the most pairs: two methods at least, if any two share a configuration.
+    several the one with the fewest. The methods and configurations with the largest number of pairs are
+    selected: at least two methods, if any two share a configuration.
 
     Args:
         scores: By method and configuration, shape [run] each.

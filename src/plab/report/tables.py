@@ -153,7 +153,7 @@ def distances(runs: Runs) -> list[Table]:
 
 
 def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
-    """Return the three forms of a table of scores; ``what`` means and spreads are taken over."""
+    """Return the three forms of a table of scores; ``what`` describes the runs of means and spreads."""
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
     columns = ["task", "variant"][: 1 if unit == "task" else 2]
     cells = compare(runs, unit)
@@ -228,8 +228,8 @@ def _best(line: Sequence[tuple[Summary, int]], methods: Sequence[str]) -> list[b
 # -------------------------------------------------------------------------------------------------- agreement
 
 TOLERANCE = 0.1
-"""Differences of scores up to this count as none: about what the paper's own runs of one configuration differ
-by (its standard deviations are 0.09 in the mean)."""
+"""Tolerance for differences of scores, about the spread of the paper's runs of one configuration (mean
+standard deviation 0.09)."""
 
 AGREES = f"within two of the paper's standard deviations or {TOLERANCE:g} of its mean"
 """Criterion for the agreement of a cell."""
@@ -306,7 +306,7 @@ _DEMONSTRATIONS = "Normalised incremental IoU of the best actions known, replaye
 
 
 def solvability(runs: Runs) -> list[Table]:
-    """Return what the reference demonstrations reach beside the best method of the paper."""
+    """Return the scores of the demonstrations beside those of the paper's best method."""
     known = demonstration_scores().set_index(["task", "variant"])["score"]
     paper = paper_table("iou_per_configuration")
     best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])

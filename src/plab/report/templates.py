@@ -20,8 +20,8 @@ def render(template: str, package: str = _OWN, **values: Any) -> str:
 
     Args:
         template: Its template, which extends ``base.html``.
-        package: Package whose folder ``web`` has it.
-        **values: What the template needs.
+        package: Package with the template in its folder ``web``.
+        **values: Variables of the template.
     """
 
     def load(file: str) -> str:

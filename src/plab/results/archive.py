@@ -1,8 +1,8 @@
 """Archives: many runs in one file, for publishing or keeping under version control.
 
-An archive is a zip file of result files, each with what tables, curves and pictures need, compressed as a
-whole by xz, which finds what runs have in common; ``unxz`` and any zip program unpack it. Its members are the
-same HDF5 files as those of a results folder.
+An archive is a zip file of result files, reduced to the data for tables, curves and pictures and compressed
+as a whole by xz, which exploits redundancy between runs; ``unxz`` and any zip program unpack it. Its members
+are the same HDF5 files as those of a results folder.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def pack(
 ) -> ArchiveSummary:
     """Write runs into an archive, in one atomic step.
 
-    Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
-    where the archive itself lies there. ``results_dir`` becomes ``results``.
+    Runs in archives below ``source`` are included; packing again therefore adds new runs, also if the archive
+    itself is there. ``results_dir`` becomes ``results``.
 
     Args:
         source: Folder of results, archive, result file, or several of them.
@@ -65,8 +65,8 @@ def pack(
             thirds off. Actions and the final evaluation always keep all.
 
     Raises:
-        ResultsError: If there is nothing to pack, ``source`` is files or archives, none of which can be read,
-            two runs claim the same place, or the archive cannot be written.
+        ResultsError: If there is nothing to pack, none of the files or archives in ``source`` can be read,
+            two runs have the same name, or the archive cannot be written.
     """
     archive = Path(archive)
     if not archive.name.endswith(ARCHIVE_SUFFIX):
@@ -129,7 +129,7 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
-    """Write the runs of an archive to files of their own; files that are there already stay as they are.
+    """Write the runs of an archive to separate files; existing files are unchanged.
 
     Args:
         archive: The archive.

@@ -47,8 +47,8 @@ def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
         source: Folder of results, archive or result file.
 
     Yields:
-        Each file, or place in an archive, with its fault, or None. What cannot be read in an archive goes by
-        the archive's path.
+        Each file, or place in an archive, with its fault, or None. Unreadable members are reported with the
+        archive's path.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
@@ -93,7 +93,7 @@ def _iterations(run: RunResult) -> Iterator[str]:
     wanted = common if family is None else (*common, *family.columns)
     # Further columns of a family outside plab may hold anything.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
-    # Files of an earlier version may lack what may be unknown.
+    # Files of earlier versions may lack optional entries.
     if missing := [name for name in wanted if name not in table and name not in may_be_nan]:
         yield f"iterations lack {', '.join(missing)}"
         return

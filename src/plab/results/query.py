@@ -44,7 +44,7 @@ def query(
     """Answer an SQL query over the tables of :func:`connect`.
 
     Returns:
-        Names of the columns, the rows, and what could not be read, hence is not in them.
+        Names of the columns, the rows, and the errors of unreadable files.
 
     Raises:
         ArgumentError: If it is no query, or wrong.
@@ -72,13 +72,13 @@ def scores(
     *,
     descending: bool = False,
 ) -> tuple[pd.DataFrame, list[ResultsError]]:
-    """Return runs with their scores, a row each, and what could not be read.
+    """Return runs with their scores, one row each, and the errors of unreadable files.
 
     Args:
         source: Folder of results, archive, file or several of them.
         chosen: Choice of runs.
         keys: Further columns: those of :func:`plab.results.load`, or dotted keys of the configuration.
-        sort: Columns to sort by; by default what a run is. Runs that have no value there come last.
+        sort: Columns to sort by; default: the identity of a run. Runs that have no value there come last.
         descending: Whether the largest comes first.
 
     Returns:
@@ -123,7 +123,7 @@ _TABLES = {
 
 _TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets")
 _NUMBERS = ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best")
-"""Columns of ``runs`` whose type does not depend on which runs there are."""
+"""Columns of ``runs`` with fixed types."""
 
 _NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
 """Columns of a table of runs that are no scalars of the final evaluation."""

@@ -39,7 +39,7 @@ _SUMMARY: dict[str, type | tuple[type, ...]] = {
 """Fields of :class:`RunResult` in the attribute ``summary``, and their types."""
 
 _COMPACT = ("v110", "v110")
-"""HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
+"""HDF5 file format of 2016; groups and small data sets take a third of the space of the oldest format."""
 
 _RATIO, _SMALL = 1_100, 1 << 16
 """Maximum number of bytes that a stored byte of a dataset may stand for (deflate reaches 1,032), and the size
@@ -93,7 +93,7 @@ def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = Fals
 def encode(result: RunResult, *, compress: bool) -> bytes:
     """Return the bytes of the HDF5 file, built in memory: then a full disk is a plain OSError, not HDF5's.
 
-    The target is left out if it came from a file of the user's, whose licence is unknown.
+    Targets from user files are left out, because their licence is unknown.
     """
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if compress else {}
     # A name of its own: Ctrl-C inside h5py can leave the previous image open, under its name.
@@ -302,7 +302,7 @@ def _member(file: h5py.Group, path: str) -> Any:
 
 
 def _numbers(file: h5py.Group, path: str) -> np.ndarray:
-    # Several times as fast as h5py's datasets, of which a file has twenty.
+    # Several times as fast as h5py's high-level interface; a file has twenty datasets.
     found = _member(file, path)
     layout = found.get_create_plist()
     elsewhere = layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count()

@@ -45,7 +45,7 @@ from plab.results.schema import (
 )
 
 _PROGRESS_EVERY = 1.0
-"""Interval at which a run writes its progress beside its file [s]."""
+"""Interval at which a run updates its progress file [s]."""
 
 _log = logging.getLogger(__name__)
 
@@ -119,14 +119,14 @@ class RunFile:
 
     def _remove_leftovers(self) -> None:
         """Remove files left by a process that was killed just after it had finished the run."""
-        # Where nothing can be removed it stays. A held lock means that the run is being computed again.
+        # Errors of removal are ignored. If the lock is held, the run is being recomputed.
         with suppress(OSError):
             if (lock := acquire(self.path)) is not None:
                 self._remove(REPLAY_SUFFIX, PARTIAL_SUFFIX)
                 lock.release()
 
     def _files(self) -> list[Path]:
-        """Return the files of the run beside its lock, whoever has made them."""
+        """Return the files of the run, except its lock."""
         stem, lock = f"{self.path.stem}.", lock_path(self.path)
         return [path for path in self.path.parent.iterdir() if path.name.startswith(stem) and path != lock]
 
@@ -137,9 +137,9 @@ class RunFile:
                 path.unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """Let go of a run that is refused, and remove its files, unless it can resume from them.
+        """Release a rejected run, and remove its files unless it can resume from them.
 
-        Files of an earlier process stay.
+        Files of earlier processes are kept.
         """
         if self._lock is not None and not self.result.rows:
             for path in set(self._files()) - self._found:
@@ -153,7 +153,7 @@ class RunFile:
     def _release_empty_folders(self) -> None:
         self.release()
         with suppress(OSError):
-            # Of method, task and results, up to one that is not empty.
+            # Folders of method, task and results, as far as they are empty.
             for folder in self.path.parents[:3]:
                 folder.rmdir()
 
@@ -245,7 +245,7 @@ class RunFile:
         )
         write(result, self.path, compress=True)
         self._state = result, ()
-        # What cannot be removed is left to the next process.
+        # Files that cannot be removed are left to the next process.
         with suppress(OSError):
             self.partial_path.unlink(missing_ok=True)
         self.release()
@@ -344,7 +344,7 @@ def lock_path(path: str | Path) -> Path:
 
 
 def acquire(path: str | Path) -> Lock | None:
-    """Take the lock of a run, by its final or partial result file, whose folder exists.
+    """Acquire the lock of a run, given its final or partial result file in an existing folder.
 
     Returns:
         The lock, or None if another process, or another lock object of this process, holds it.
@@ -369,7 +369,8 @@ def held(path: str | Path) -> bool:
     except Timeout:
         return True
     except OSError as error:
-        # Without locks nobody computes. A file that may not even be opened is somebody else's.
+        # Without lock support, no other process can hold it. A file that may not even be opened is somebody
+        # else's.
         return error.errno not in (*_NO_LOCKS, errno.EROFS)
     return False
 
@@ -400,7 +401,7 @@ _PACKAGES = (
     "h5py",
     "hydra-core",
 )
-"""Distributions whose versions are recorded. They are not imported: torch alone takes seconds."""
+"""Distributions with recorded versions. They are not imported: torch alone takes seconds."""
 
 
 def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -460,7 +461,7 @@ def _git() -> tuple[str, bool]:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # An installed plab may lie inside somebody else's repository, whose commit says nothing about it.
+        # An installed plab may be inside an unrelated repository.
         git("ls-files", "--error-unmatch", here.name)
         return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):

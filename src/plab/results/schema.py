@@ -32,15 +32,14 @@ ARCHIVE_SUFFIX = ".plab.zip.xz"
 _MEASURES = ("loss", "reward", "iou", "score")
 
 BUDGETS = ("steps_forward", "steps_gradient")
-"""Columns of what a run has simulated up to the end of a row, in environment steps: without a gradient, and
-with one."""
+"""Columns of the environment steps simulated up to the end of a row, without and with gradient."""
 
 COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
-"""Columns that the iterations of every method have, beside those of :func:`loss_columns`;
-:mod:`plab.config.families` has those of a family."""
+"""Columns of the iterations of all methods, in addition to :func:`loss_columns`; :mod:`plab.config.families`
+has those of a family."""
 
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
-"""Scalars of the final evaluation, beside those of :func:`loss_columns`."""
+"""Scalars of the final evaluation, in addition to :func:`loss_columns`."""
 
 _NEEDED: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("task", "method", "sim", "protocol"), dict),
@@ -89,7 +88,7 @@ class RunResult:
         evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
         labels: Meaning and unit of the loss's terms, by column.
         masses: Mass tensors by name (``initial``, ``final``, ``target``), each of shape [n, n, n].
-        resume: Nested state from which the run goes on: arrays, numbers, strings; None in finished files.
+        resume: Nested state for resuming the run: arrays, numbers, strings; None in finished files.
         path: File this was read from.
     """
 
@@ -171,7 +170,7 @@ def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def row_count(method: Mapping[str, Any]) -> int | None:
-    """Return how many rows a run of a method has when it is finished, where its section ``method`` tells."""
+    """Return the number of rows of a finished run, if the section ``method`` determines it."""
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")

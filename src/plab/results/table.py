@@ -64,7 +64,7 @@ COLUMNS = (
 _INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
 
 _TIMESTAMP_RESOLUTION = 2.0
-"""Age from which on a file's times identify its contents [s]: file systems round them."""
+"""Age after which the times of a file identify its contents [s], because file systems round them."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class Row:
 
 
 Index = dict[str, tuple[str, list[tuple[str, str, str]]]]
-"""By the path below the folder: identity of the file, and of each of its runs the name in an archive (empty
-for a file of its own) and the two parts of :class:`Row` as JSON."""
+"""By path below the folder: identity of the file, and for each of its runs the name in an archive (empty for
+single files) and the two parts of :class:`Row` as JSON."""
 
 
 def load(
@@ -95,9 +95,9 @@ def load(
 ) -> pd.DataFrame:
     """Load results, a row per run.
 
-    Partial files are included (their status tells them apart) unless the same run has a finished file, and so
-    are the runs in archives unless the folder has the same run in a file. Files that cannot be read are named
-    in one warning.
+    Partial files are included, with their status, unless the same run has a finished file; runs in archives
+    are included unless the folder has the same run as a file. Files that cannot be read are named in one
+    warning.
 
     Args:
         source: A folder, searched with its subfolders, an archive, a single result file, or several of them;
@@ -133,7 +133,7 @@ def warn_of(unreadable: Sequence[ResultsError]) -> None:
 def rows(
     source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
 ) -> tuple[list[Row], list[ResultsError]]:
-    """Return the rows of :func:`load` with their configurations, and what could not be read.
+    """Return the rows of :func:`load` with their configurations, and the errors of unreadable files.
 
     A file is read in full before it has a row, so that its iterations and actions can be read afterwards.
 
@@ -146,7 +146,7 @@ def rows(
 
 
 def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
-    """Return the same as :func:`rows`, but raise where files are asked for and none can be read.
+    """As :func:`rows`, but raise if files are requested and none can be read.
 
     Raises:
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
@@ -217,14 +217,14 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
-    """Yield the rows of a result file or an archive, and what is wrong where there is none."""
+    """Yield the rows of a result file or an archive, or an error."""
     return read_each(path, _row)
 
 
 def read_each(
     path: Path, extract: Callable[[h5py.File, Path], T], wanted: set[str] | None = None
 ) -> Iterator[T | ResultsError]:
-    """Yield what ``extract`` takes from a result file or from each run of an archive, or what is wrong.
+    """Yield the result of ``extract`` for a result file or for each run of an archive, or an error.
 
     Args:
         path: The file or archive.
@@ -278,7 +278,7 @@ def _read(path: Path) -> list[Row | ResultsError]:
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:
-    """Leave out what the same configuration's finished run makes superfluous.
+    """Leave out runs superseded by a finished run of the same configuration.
 
     Of loose files that are as good as each other all stay, of archived runs only the first, and none where
     there is a loose one.
@@ -298,7 +298,7 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 
 def _row(file: h5py.File, path: Path) -> Row:
-    """Return the row of an open file, all of whose columns and actions can be read."""
+    """Return the row of an open file, after checking that all columns and actions can be read."""
     config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), curves_of(file)
     actions_of(file)
     # A method's section that cannot be counted is named here, not where a table is made.

@@ -1,4 +1,4 @@
-"""Cameras as data: where they stand, what they look at, and the size of their pictures."""
+"""Camera parameters: position, target and picture size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Camera:
         target: Point in the middle of the picture [domain units].
         field_of_view: Vertical field of view [degrees], in (0, 180).
         size: Width and height of pictures [pixels].
-        near: Depth from which on things are seen [domain units], positive.
+        near: Near clipping depth [domain units], positive.
         far: Depth beyond which nothing is seen [domain units]; the depth of pixels in which nothing is.
     """
 

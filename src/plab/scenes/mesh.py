@@ -32,7 +32,7 @@ _PAIRS = 1 << 21
 """Pairs of a point and a triangle that are tested together, limited by their memory."""
 
 _TRIED = 1 << 15
-"""Points tried when the enclosed volume is compared with that of the faces."""
+"""Number of sample points to compare the enclosed volume with that of the faces."""
 
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
@@ -71,7 +71,7 @@ def read_mesh(file: str, **options: Any) -> Any:
         import trimesh
     except ImportError:
         raise ShapeError(f"{file} is read with trimesh: pip install 'plab[mesh]'") from None
-    # Without a handler, warnings of its parsers would be printed beside plab's own message.
+    # Without a handler, warnings of its parsers would be printed in addition to plab's message.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     kind = Path(file).suffix[1:].lower()
     with warnings.catch_warnings():
@@ -86,7 +86,7 @@ def read_mesh(file: str, **options: Any) -> Any:
 
 
 class Mesh:
-    """A solid in units of the longest edge of its bounding box, whose centre is the origin.
+    """A solid centred at the origin, in units of the longest edge of its bounding box.
 
     Meshes are equal if their files are.
 

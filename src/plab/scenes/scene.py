@@ -77,7 +77,7 @@ class ManipulatorShape:
         motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation),
             ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
-        outline: Shape whose surface it has; its own name if empty.
+        outline: Shape with the same surface; default: its own name.
     """
 
     size_names: tuple[str, ...]
@@ -168,7 +168,7 @@ class Manipulator:
 
     @property
     def outline(self) -> str:
-        """Shape whose surface it has."""
+        """Shape with the same surface."""
         return self.kind.outline or self.shape
 
     @property
@@ -177,8 +177,8 @@ class Manipulator:
         return len(self.kind.action_names)
 
     def largest_step(self) -> float:
-        """Bound on how far any of its points moves in an environment step [domain units]; 0 for a link, whose
-        motion is bounded by the model that it belongs to."""
+        """Upper bound of the displacement of any of its points in an environment step [domain units]; 0 for
+        links, whose motion is bounded by their model."""
         motion, scale = self.kind.motion, np.abs(self.scale)
         reach = sum(self.size) + self.gap
         if motion in ("static", "twist"):
@@ -198,7 +198,7 @@ class Scene:
         name: Task name, for messages.
         bodies: Bodies of plasticine.
         manipulators: Manipulators, in the order in which they act on the grid and in the action vector.
-        youngs_modulus: Young's modulus E of bodies that have none of their own.
+        youngs_modulus: Young's modulus E of bodies without their own.
         poisson_ratio: Their Poisson ratio nu.
         yield_stress: Their von Mises yield stress; ``inf`` for purely elastic bodies.
         floor_friction: Floor friction: 0 slips, 10 and more sticks, Coulomb-like in between.
@@ -210,7 +210,7 @@ class Scene:
         particle_seed: Seed of the particles' positions.
         sampling_convention: Random generator of these positions, one of :data:`CONVENTIONS`.
         digits_convention: Treatment of rotations that are not quite of unit length, likewise: ``plab``
-            normalises them, ``release`` leaves the poses at t = 0 as they are until something moves.
+            normalises them, ``release`` keeps the initial poses unchanged until the first motion.
         floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's reaches the
             layer of nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
         kinematics: Articulated model whose links are the last manipulators; None without one.
@@ -255,7 +255,7 @@ class Scene:
 
     @property
     def material(self) -> Material:
-        """Material of bodies that have none of their own."""
+        """Material of bodies without their own."""
         return Material(self.youngs_modulus, self.poisson_ratio, self.yield_stress)
 
     @property
@@ -270,7 +270,7 @@ class Scene:
 
     @property
     def laws(self) -> tuple[str, ...]:
-        """Names of the laws of its materials: 1, or one per body where any body has a material of its own."""
+        """Names of the laws of its materials: one, or one per body if any body has its own material."""
         return tuple(material.law for material in self.materials[: self.material_count]) or (
             self.material.law,
         )
@@ -287,7 +287,7 @@ class Scene:
 
     @property
     def tools(self) -> tuple[Manipulator, ...]:
-        """Manipulators with actions of their own: all but the links of an articulated model."""
+        """Manipulators with their own actions: all except the links of an articulated model."""
         links = len(self.kinematics.links) if self.kinematics else 0
         return self.manipulators[: len(self.manipulators) - links]
 
@@ -315,7 +315,8 @@ class Scene:
         return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
 
     def facts(self) -> dict[str, Any]:
-        """Return the scene as plain data, apart from meshes, without what a body shares with the scene."""
+        """Return the scene as plain data, except meshes, without values that bodies inherit from the
+        scene."""
         facts = asdict(self)
         if self.kinematics is None:
             del facts["kinematics"]

@@ -1,4 +1,4 @@
-"""Survey of runs: what is done, running, failed and missing, with scores and the time that is left."""
+"""Survey of finished, running, failed and missing runs, with scores and remaining time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RECENT_ROWS = 20
 
 @dataclass
 class Run:
-    """One of the runs that are asked for.
+    """A requested run.
 
     Attributes:
         task: Name of the task.
@@ -81,12 +81,12 @@ class Group:
     Attributes:
         task: Name of the task.
         method: Name of the method.
-        expected: Number of runs that are asked for.
+        expected: Number of requested runs.
         counts: Number of them in each of :data:`STATES`.
         score: Mean score of those that are done; None if none is.
         mean_seconds: Mean wall time of those that are done [s]; None if none is.
         rate: Mean rate of those that are running [1/s]; None if none is.
-        left: Time that one worker needs for what is not done [s]; None if it is not known.
+        left: Remaining time with one worker [s]; None if it is not known.
     """
 
     task: str
@@ -101,12 +101,12 @@ class Group:
 
 @dataclass
 class Survey:
-    """All that is known about the runs that are asked for.
+    """State of the requested runs.
 
     Attributes:
         runs: Every one of them.
         groups: The same by task and method.
-        others: Number of further runs in the results: not asked for, or of other settings.
+        others: Number of other runs in the results: not requested, or with other settings.
         unreadable: Messages about files that could not be read.
         protocol: Name of the runs' protocol.
     """
@@ -140,7 +140,7 @@ class Survey:
 
 
 def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, missing: bool = False) -> Survey:
-    """Find the state of the runs that are asked for.
+    """Find the state of the requested runs.
 
     Args:
         source: Folder of results, archive, or several.
@@ -179,7 +179,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
 
 def _expected(present: Collection[Key], chosen: Selection, missing: bool) -> list[Key]:
-    """Return the runs that are asked for, by task, method, variant and seed."""
+    """Return the requested runs, by task, method, variant and seed."""
     tasks, free = suite_tasks(), [[[part] for part in key] for key in present]
     if missing or (not present and chosen.choices):
         methods, seeds = ({key[number] for key in present} for number in (2, 3))

@@ -17,7 +17,7 @@ from plab.errors import ArgumentError, tell
 from plab.status.survey import STATES, Survey
 
 INTERVAL = 1.0
-"""Interval between two looks [s]."""
+"""Update interval [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
 """Colours of states, in the order in which runs are shown where there is no room for all."""

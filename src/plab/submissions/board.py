@@ -119,7 +119,7 @@ _SHOWN_IF_EMPTY = 4
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
-    """Make the leaderboard of a folder of submissions, each with what ``plab verify`` has kept beside it.
+    """Generate the leaderboard for a folder of submissions and their verifications by ``plab verify``.
 
     Overrides are settings of every configuration that belongs here, if not plab's own.
 

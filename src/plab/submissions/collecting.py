@@ -82,7 +82,7 @@ def steps_to_best(row: Row) -> int:
 def from_policies(
     policies: Mapping[str, Path], variants: Sequence[str], steps: int, overrides: Sequence[str]
 ) -> tuple[list[Entry], dict[str, bytes]]:
-    """Let policies act, and collect what they reach.
+    """Run policies, and collect their episodes.
 
     Args:
         policies: Files of TorchScript (``.pt``) or ONNX (``.onnx``), by task. They are executed.

@@ -80,7 +80,7 @@ class _BestEpisodes:
 
 
 def record(env: Env, folder: str | Path) -> Env:
-    """Record what an agent reaches, for ``plab submit``.
+    """Record the episodes of an agent, for ``plab submit``.
 
     Of each configuration a file in ``folder`` holds the actions of the best episode within each budget of
     :data:`plab.report.series.BUDGETS` and of the best one of all, with the environment steps simulated until
@@ -88,7 +88,7 @@ def record(env: Env, folder: str | Path) -> Env:
     better; episodes that are left before their end count by their steps.
 
     Args:
-        env: An environment of plab's in the hard contact model, single or vector, in any wrappers.
+        env: A single or vector environment of plab in the hard contact model, with any wrappers.
         folder: Folder of the recordings, of this training only.
 
     Returns:

@@ -42,7 +42,7 @@ TARGETS = ("suite", "authors")
 """Sources of targets: the suite's recipes, or the files of the original release."""
 
 UNSEEN = tuple(f"random{seed}" for seed in range(9000, 9010))
-"""Variants of every task that nothing may be trained on: ``variant=random`` with these ``seed_scene``."""
+"""Variants of every task reserved for evaluation: ``variant=random`` with these ``seed_scene``."""
 
 VARIANTS = (*SUITE_VARIANTS, *UNSEEN)
 
@@ -128,7 +128,7 @@ def variant_words(task: str, variant: str) -> list[str]:
 
 
 def configuration_of(cfg: Config) -> Configuration:
-    """Return the leaderboard's name of a configuration of plab's.
+    """Return the leaderboard's name for a configuration.
 
     Raises:
         SubmissionError: If the leaderboard has no such configuration.
@@ -150,7 +150,7 @@ def configuration_of(cfg: Config) -> Configuration:
 
 @dataclass(frozen=True)
 class Checksums:
-    """SHA-256, in hex, of scene and target, which decide a score beside the actions.
+    """SHA-256, in hex, of scene and target, which together with the actions determine a score.
 
     Attributes:
         scene: Of bodies, manipulators, material, discretisation and horizon.
@@ -211,7 +211,7 @@ class Submission:
     """Content of a file.
 
     Attributes:
-        card: The method; None in what a recorder writes.
+        card: The method; None in recordings.
         entries: Plans, or policies.
         policies: Files of the policies, by name.
         plab: Version of plab that wrote it.

@@ -1,6 +1,6 @@
 """Verification of submissions: every claim is simulated again, in float32 and in float64.
 
-Policies are TorchScript or ONNX. Loading one executes it, hence only where that was asked for.
+Policies are TorchScript or ONNX. Loading a policy executes it, so this happens only on request.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 class ReplayedScore(NamedTuple):
-    """Score of an episode's last state, NaN if it broke off, and the failure."""
+    """Score of an episode's last state, NaN after a divergence, and the reason."""
 
     score: float
     failure: str = ""
@@ -110,14 +110,14 @@ def verify(
     given = tuple(overrides)
     cfgs = _configs(submission, given)
     scores: dict[int, dict[str, ReplayedScore]] = defaultdict(dict)
-    # Each group is what one simulator can play.
+    # Each group fits into one simulator.
     alike: dict[Any, list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
         configuration = entry.configuration
         if run_policies or not entry.policy:
             alike[configuration.task, configuration.targets, configuration.terms, entry.policy].append(number)
     policies = {name: load_policy(name, submission.policies[name]) for *_, name in alike if name}
-    # Going from one precision to the other starts Taichi anew.
+    # Changing the precision restarts Taichi.
     for precision in precisions:
         for (*_, name), numbers in alike.items():
             entries = [submission.entries[number] for number in numbers]
@@ -131,7 +131,7 @@ def verify(
 
 
 def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
-    """Compose all configurations, and refuse those that are not what the submission was made for."""
+    """Compose all configurations, and reject those that differ from the submission's."""
     if submission.physics != PHYSICS_VERSION:
         raise SubmissionError(
             f"{submission.path} is of physics version {submission.physics} (plab {submission.plab}), this "
@@ -278,12 +278,12 @@ def _reason(error: Exception) -> str:
 
 
 def verification_path(submission: Path) -> Path:
-    """Return the file beside a submission that keeps its verification."""
+    """Return the path of a submission's verification file."""
     return submission.with_name(submission.name.removesuffix(SUFFIX) + ".verified.json")
 
 
 def write_verification(verification: Verification, submission: Path) -> Path:
-    """Write a verification beside its submission; return the file.
+    """Write the verification file of a submission; return its path.
 
     Raises:
         plab.results.ResultsError: If it cannot be written.
@@ -316,7 +316,7 @@ def read_verification(submission: Submission) -> Verification | None:
     """Return the verification of a submission; None if this very file was not verified with these physics.
 
     Raises:
-        SubmissionError: If the file beside it cannot be read.
+        SubmissionError: If the verification file cannot be read.
     """
     if submission.path is None:
         return None

@@ -38,7 +38,7 @@ def gpu_workers(
     Args:
         per_gpu: Number of processes of each GPU.
         most: Largest number of processes.
-        look_up: Returns the outcome of a run whose process was killed.
+        look_up: Function that returns the outcome of a run whose process was killed.
 
     Yields:
         Function that carries out batches by them, and the number of processes.
@@ -91,8 +91,8 @@ def _dispatch(
 
 
 def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
-    """Return the number of the batch that a process takes: the first of the kind whose simulator it has, else
-    the first of the kind that the fewest other processes have.
+    """Return the number of the next batch for a process: the first of the kind of its simulator, otherwise
+    the first of the kind with the fewest processes.
 
     Args:
         waiting: Batches, at least one.
@@ -134,7 +134,7 @@ class _Worker:
         theirs.close()
 
     def give(self, batch: list[Config], note: str) -> None:
-        """Let it carry out a batch."""
+        """Send a batch to the process."""
         if not self.process.is_alive():
             self._start()
         self.batch, self.kind = batch, _kind(batch)
@@ -156,7 +156,7 @@ class _Worker:
             yield "ended", outcomes
 
     def dismiss(self) -> None:
-        """End the process; one that is at work is interrupted."""
+        """End the process, interrupting a batch in progress."""
         self.connection.close()
         if self.batch:
             self.process.terminate()
@@ -169,9 +169,9 @@ class _Worker:
 
 
 def _work(name: str, connection: Connection) -> None:
-    """Carry out batches until there are no more; runs in a process of its own."""
+    """Execute batches until none are left; runs in a separate process."""
     os.environ[VISIBLE] = name
-    # Where what ignores Ctrl-C is not inherited.
+    # On platforms where an ignored Ctrl-C is not inherited.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -184,7 +184,7 @@ def _work(name: str, connection: Connection) -> None:
             batch, note = connection.recv()
             connection.send(("ended", runners.run_batch(batch, note, cache)))
     except (EOFError, OSError, KeyboardInterrupt):
-        # Nobody is there any more, or nobody wants more.
+        # The parent has ended, or no batches are left.
         return
 
 

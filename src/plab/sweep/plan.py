@@ -31,7 +31,7 @@ def plan(
         cfgs: The composed and checked configurations.
         size: Largest number of runs in a batch; None: as many as fit, trajectories and planners in
             ``sim.memory_mb``, agents in half of the device's memory.
-        processes: Number of processes, each of which is to have a batch if there are runs enough.
+        processes: Number of processes; each gets a batch if there are enough runs.
         sharing: Number of processes that share a device, and its memory.
 
     Returns:

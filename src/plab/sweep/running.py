@@ -49,10 +49,10 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         config_dir: Folder with files of the user's own.
 
     Returns:
-        Exit code: 0 if every result is there, 2 if a run was refused, else 1.
+        Exit code: 0 if all results exist, 2 if a run was rejected, otherwise 1.
 
     Raises:
-        ConfigError: If the overrides give no runs, or all of them are refused for the same reason.
+        ConfigError: If the overrides give no runs, or all runs are rejected for the same reason.
     """
     if not master.hydra.sweeper["_target_"].endswith(".BasicSweeper"):
         raise ConfigError(
@@ -65,7 +65,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
     cfgs = [one for one in entries if isinstance(one, Config)]
     ended = [one for one in entries if isinstance(one, Outcome)]
     if not cfgs and len({one.message for one in ended}) == 1:
-        # A mistake in what all jobs have in common.
+        # An error common to all jobs.
         raise ConfigError(ended[0].message)
     with ExitStack() as stack:
         carry, processes = carry_here, 1
@@ -124,7 +124,7 @@ def jobs_of(
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
-    """Compose and check the runs of a sweep; what several of them share, once.
+    """Compose and check the runs of a sweep; shared parts are checked once.
 
     Args:
         jobs: Prepared overrides of each.
@@ -150,7 +150,8 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
 
 
 def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
-    """Return the configuration of some overrides, or what is wrong with it, its scene or its target."""
+    """Return the configuration for some overrides, or the error in the configuration, the scene or the
+    target."""
     try:
         cfg = finish(compose(words, config_dir), words, alone=False)
         check_sources(cfg)
@@ -231,7 +232,7 @@ def _carry_elsewhere(
             returns = launcher.launch([jobs[str(batch[0].path)] for batch in batches], 0)
         yield from [one for job in returns for one in job.return_value]
     except Exception as error:
-        # A job's process was killed, or the queue refused the jobs: the files know how far they came.
+        # A job was killed, or the queue rejected the jobs; the result files have the progress.
         tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
         yield from [look_up(cfg) for batch in batches for cfg in batch]
 
@@ -244,7 +245,7 @@ def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Out
 
 
 def look_up(cfg: Config) -> Outcome:
-    """Return from its files the outcome of a run whose process was killed."""
+    """Return the outcome of a run whose process was killed, from its files."""
     path = cfg.path
     if (done := _finished_before(cfg)) is not None:
         return Outcome.of(cfg, "finished", done.score)
@@ -260,11 +261,11 @@ def look_up(cfg: Config) -> Outcome:
 
 
 def _finished_before(cfg: Config) -> Outcome | None:
-    """Return the outcome of a run whose result is there."""
+    """Return the outcome of a run with an existing result."""
     path = cfg.path
     left = (lock_path(path), path.with_suffix(PARTIAL_SUFFIX))
     try:
-        # RunFile removes what a killed process has left.
+        # RunFile removes leftovers of killed processes.
         result = RunFile(cfg).result if path.exists() and any(map(Path.exists, left)) else read(path)
     except ResultsError:
         return None

@@ -114,7 +114,7 @@ def build_targets(
     Args:
         simulator: Simulator of the scenes that the targets belong to.
         targets: ``recipe`` and the recipe's parameters, one per environment.
-        rebuild: Simulate even what is cached.
+        rebuild: Simulate also cached targets.
 
     Returns:
         Mass tensors, shape [batch, n, n, n], float64.

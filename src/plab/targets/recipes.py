@@ -1,7 +1,7 @@
 """Target recipes that need no simulation, and the classes of all recipes.
 
-Solids, whose points are drawn uniformly and spread over the grid, and files with a point cloud or a mass
-tensor. Total masses agree with the scene's.
+Recipes for solids, filled with uniformly sampled points, and for files with a point cloud or a mass tensor.
+Total masses agree with the scene's.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TargetError(PlabError, ValueError):
 
 
 class Recipe:
-    """A target recipe; its subclasses are dataclasses whose fields are the keys of the section ``target``."""
+    """A target recipe; subclasses are dataclasses with the keys of the section ``target`` as fields."""
 
 
 class TensorRecipe(Recipe, ABC):
@@ -88,7 +88,8 @@ class TargetBody:
     sha256: str | None = None
 
     def build(self, particles: int) -> Body:
-        """Return the body with so many particles; see :func:`plab.scenes.make_body` for errors."""
+        """Return the body with the given number of particles; see :func:`plab.scenes.make_body` for
+        errors."""
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 
@@ -116,7 +117,7 @@ class BodiesTarget(PointsRecipe):
         volumes = np.array([solid.volume for solid in solids])
         if not np.all(volumes > 0):
             raise TargetError("target.bodies: sizes must be positive")
-        # Rounding the running total shares out every particle and errs by less than one per body.
+        # Rounding the running total distributes all particles, with an error below one per body.
         ends = np.rint(np.cumsum(volumes) / volumes.sum() * scene.particle_count).astype(int)
         counts = np.diff(ends, prepend=0)
         bodies = tuple(replace(solid, particles=int(n)) for solid, n in zip(solids, counts, strict=True))
@@ -133,7 +134,7 @@ class RingTarget(PointsRecipe):
     """A closed, level ring of square section around a manipulator.
 
     Attributes:
-        around: Index of the manipulator whose x and z are the ring's centre.
+        around: Index of the manipulator at the centre of the ring (x and z).
         radius: Mean radius [domain units].
         section: Edge of the square section [domain units].
         floor: Height of the underside [domain units].
@@ -177,16 +178,17 @@ _NEGATIVE = 1e-3
 """Share of a mass tensor that rounding may have put below zero."""
 
 _MEASURED = 1000
-"""Maximum number of points whose distance to the next one is measured."""
+"""Maximum number of points used to measure spacing."""
 
 
 @dataclass
 class PointsTarget(PointsRecipe):
-    """A solid that points fill, in domain units; those of a closed surface alone are refused, or filled.
+    """A solid filled with points, in domain units; points on a closed surface are rejected, or the surface is
+    filled.
 
     Attributes:
-        file: NumPy array of shape [point, 3], PLY file, of which the vertices count, or XYZ file. A relative
-            one is looked for in the working directory, in the config folder and in the folder above it.
+        file: NumPy array of shape [point, 3], PLY file (its vertices), or XYZ file. A relative one is looked
+            for in the working directory, in the config folder and in the folder above it.
         sha256: SHA-256 of the file. Found out where it is not given; refused if it is another one.
         fill: Fill the space that the points enclose.
     """
@@ -224,8 +226,8 @@ class PointsTarget(PointsRecipe):
 
 
 def _filled(points: np.ndarray, n: int) -> tuple[np.ndarray, float]:
-    """Return the cells of the solid that points lie in or enclose, bool, shape [n, n, n], and the share of
-    those whose neighbours are as empty as they are."""
+    """Return the cells that contain points or are enclosed by them, bool, shape [n, n, n], and the fraction
+    of hollow cells."""
     # Imported here: SciPy's start-up would be paid by every `--help`.
     from scipy.ndimage import binary_closing, binary_dilation, binary_fill_holes
 

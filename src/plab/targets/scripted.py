@@ -20,13 +20,13 @@ from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene, Sc
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 DRAWS = 200
-"""Maximum number of draws of a script whose way is too long for an episode."""
+"""Maximum number of samples until a script fits into an episode."""
 
 CLEARANCE = 0.02
 """Height at which a body is carried over another [domain units]."""
 
 DECIMALS = 4
-"""Actions are rounded to so many decimals: what is written down is exactly what was simulated."""
+"""Number of decimals of actions, so that stored actions are exactly the simulated ones."""
 
 
 class _TooLong(Exception):
@@ -46,8 +46,8 @@ class ActionTrack:
         return len(self._actions)
 
     def go(self, way: ArrayLike, steps: int = 1) -> None:
-        """Add a straight, even motion, one entry per action component [domain units or radians], in so many
-        steps at least; in more if the way is too long for them."""
+        """Add a uniform motion, one entry per action component [domain units or radians], in at least the
+        given number of steps, or more if the distance requires it."""
         way = np.asarray(way, dtype=float)
         # A component that cannot move has scale 0.
         share = np.divide(way, self._scale, out=np.zeros_like(way), where=self._scale > 0)
@@ -56,7 +56,7 @@ class ActionTrack:
         self._actions += [share / steps] * steps
 
     def wait(self, until: int) -> None:
-        """Stay where it is until so many steps are over."""
+        """Stay at rest until the given step."""
         self._actions += [np.zeros_like(self._scale)] * (until - len(self))
 
     def delay(self) -> None:
@@ -70,7 +70,7 @@ class ActionTrack:
         return self.first(EPISODE_STEPS)
 
     def first(self, steps: int) -> np.ndarray:
-        """Return the actions of so many steps, shape [steps, A]; what comes later is cut off."""
+        """Return the actions of the given number of steps, shape [steps, A]; later ones are cut off."""
         self.wait(steps)
         return np.clip(np.round(self._actions[:steps], DECIMALS), -1.0, 1.0)
 
@@ -82,7 +82,7 @@ class Script(Recipe, ABC):
     Attributes:
         seed: Seed of the draws, >= 0.
         youngs_modulus: Young's modulus E during the demonstration; the scene's if None, and so on. Bodies
-            with a material of their own keep that.
+            with their own material keep it.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress.
     """
@@ -313,7 +313,7 @@ class CarryTarget(PlannedScript):
         squeeze, press = _draw(rng, "squeeze", self.squeeze), _draw(rng, "press", self.press)
         x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
         rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
-        # The leading sphere goes up beside the base and passes its edge at the height of its top.
+        # The leading sphere rises next to the base and passes its edge at the height of the top.
         lead = max(abs(tool.position[0] - cargo.center[0]) + tool.size[0] for tool in tools)
         lowest = min(tool.position[1] - tool.size[0] for tool in tools)
         edge = abs(x) - base.half_extent()[0] - lead
@@ -334,7 +334,7 @@ class PushTarget(PlannedScript):
 
     Attributes:
         legs: So many of the scene's first bodies are legs.
-        distance: Range of how far it goes on after it has met the leg [domain units].
+        distance: Range of the distance travelled after contact with the leg [domain units].
         steps: Environment steps that this takes at least; with more, the table follows.
     """
 
@@ -459,7 +459,7 @@ def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
 
 
 def _arc(start: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
-    """Points on the way around the origin from one point to another, the start left out; both [3]."""
+    """Return points on a path around the origin from one point to another, without the start; both [3]."""
     a, b = np.linalg.norm(start), np.linalg.norm(end)
     angle = math.acos(float(np.clip(start @ end / (a * b), -1.0, 1.0)))
     if angle < 1e-6:

@@ -32,8 +32,8 @@ MASS_TOLERANCE = 0.02
 NEGATIVE_PARTICLES = 3.0
 """Particle masses that the negative masses of a release target may add up to.
 
-The release's stencil makes them: truncated toward zero, it gives a particle at the domain's lower face a
-weight of -0.25, and a stray one beyond it, of which three of the fifty targets have one, down to -1.5.
+They come from the release's stencil: truncated toward zero, it has a weight of -0.25 for a particle at the
+lower face of the domain, and down to -1.5 for the stray particles outside in three of the fifty targets.
 """
 
 

@@ -21,10 +21,10 @@ _HEIGHT = 480
 
 @dataclass(frozen=True)
 class Viewer:
-    """A rollout in 3-D; a notebook whose cell ends with it shows the viewer.
+    """A rollout in 3-D, displayed by notebooks as the result of a cell.
 
     Attributes:
-        page: The page, HTML; written to a file it is what ``plab view`` writes.
+        page: HTML page, as written by ``plab view``.
         score: Score of the last state, NaN without a target.
         height: Height of the viewer in a notebook [pixels].
     """
@@ -34,7 +34,7 @@ class Viewer:
     height: int = _HEIGHT
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own, apart from the notebook's styles and scripts."""
+        """Return the page in a frame, isolated from the notebook's styles and scripts."""
         style = f"width: 100%; height: {self.height}px; border: 0"
         return f'<iframe title="rollout in 3-D" style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
@@ -53,7 +53,7 @@ def show(
     configuration says: Taichi has one of each at a time, and with another they would lose their memory.
 
     Args:
-        what: A result file, whose best actions are played; or a configuration.
+        what: A result file, to replay its best actions; or a configuration.
         actions: Actions in [-1, 1] for the configuration, shape [T, A]; None: the best that are known for its
             task, or an episode of zeros where none are.
         every: Environment steps from one frame to the next, between which the viewer interpolates; None: so

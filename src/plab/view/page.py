@@ -33,7 +33,7 @@ from plab.render.surface import body_slices, body_surfaces
 _FRAMES = 60
 _POSITIONS = 600_000  # of particles in all frames together: some 6 MB of the page
 _VERTICES = 300_000  # of surfaces, likewise
-_LEVELS = 2**16  # per domain unit, to which positions are rounded: what is not there need not be packed
+_LEVELS = 2**16  # per domain unit, to which positions are rounded for compression
 _STEPS_PER_SECOND = 10
 _ASPECT = 4 / 3  # of the window that the camera is fitted to; the page moves it away in a narrower one
 _GHOST_OPACITY = 0.3
@@ -190,7 +190,7 @@ def _with_bar(
     *,
     interpolate: bool,
 ) -> str:
-    """Return K3D-jupyter's page with a title, the bar, and the licences of what is in it."""
+    """Return K3D-jupyter's page with a title, the bar, and licences."""
     scores = recording.scores
     content = {
         "steps": len(recording.x) - 1,
@@ -210,7 +210,7 @@ def _with_bar(
     head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
     snapshot = re.sub("<title>.*?</title>", lambda _: head, snapshot, count=1)
     snapshot = snapshot.replace("<body>", f"<body>\n{bar}", 1)
-    # Those of K3D-jupyter and of what it brings along ask to be passed on.
+    # Licences of K3D-jupyter and its dependencies, which must be included.
     found = sorted(path for path in installed_files("k3d") or [] if path.name in _LICENCES)
     licences = "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in found)
     return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)

@@ -1,6 +1,6 @@
 """Real results and measurements that come with plab, to see tables, curves, notebooks and pages at once.
 
-``README.md`` beside this file lists what each file holds and how it was made.
+``README.md`` in this folder describes the content and origin of each file.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from pathlib import Path
 __all__ = ["EXAMPLES", "example_archive", "measurements", "resolve"]
 
 EXAMPLES = ("example", "release", "targets", "authors")
-"""Words that stand for an archive of this folder where a folder of results is asked for: of plab's own suite,
-of the paper's benchmark on the release's terms, of plab's terms on the release's targets, and of `solve` on
-these from the release's start."""
+"""Names of the bundled archives, accepted in place of a results folder: plab's own suite, the paper's
+benchmark under the release's protocol, plab's protocol on the authors' targets, and `solve` on these targets
+with the release's initial particles."""
 
 
 def example_archive(name: str = EXAMPLES[0]) -> Path:
