@@ -73,7 +73,7 @@ PYTHON = {
             "plab.envs.sb3",
             "plab.envs.tensors",
             "plab.envs",
-            "plab.submissions.recorder",
+            "plab.submissions",
         ),
     ),
     "results": (
