@@ -33,8 +33,9 @@ from plab.config.families import FAMILIES
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, RlConfig
+from plab.runners.policy import torch_settings
 from plab.runners.ppo import PpoConfig
-from plab.runners.rl import Population, population_settings
+from plab.runners.rl import Population
 from plab.runners.training import evaluate
 from plab.sim.compiler import ti
 
@@ -78,7 +79,7 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    with population_settings(method):
+    with torch_settings(method.torch_threads, tf32=method.torch_device == "cuda"):
         own = [one for one in cfgs for _ in range(method.num_envs)]
         training, judge = EpisodeBatch(own, contact=method.contact), TensorEnv(EpisodeBatch(cfgs))
         population = Population(cfgs, training)

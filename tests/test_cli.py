@@ -14,9 +14,9 @@ import pytest
 
 from plab.cli.run import main
 from plab.config import GROUPS, Config, choices
-from plab.config.compose import cuda_devices
 from plab.results import ResultsError
 from plab.runners import RunError
+from plab.sim.runtime import cuda_devices
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

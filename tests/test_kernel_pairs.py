@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import suite
-from plab.laws import LAWS
-from plab.scenes import Body
+from plab.scenes import LAWS, Body
 from plab.sim.compiler import address_of, ti
 from plab.sim.cpu_engine import CpuPhases
 from plab.sim.cuda_phases import CudaPhases

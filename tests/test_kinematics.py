@@ -22,7 +22,7 @@ from plab.kinematics.actions import JointActions
 from plab.losses import make_terms
 from plab.problem import Problem
 from plab.runners.planners.starts import ContactStarts
-from plab.scenes import Body, Manipulator, Scene, SceneError
+from plab.scenes import Body, Manipulator, Scene, SceneError, link_manipulators
 from plab.sim import Simulator
 
 mujoco = pytest.importorskip("mujoco")
@@ -112,7 +112,7 @@ def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
         axes = data.geom_xmat[own[g]].reshape(3, 3)
         if link.shape == "CapsuleLink":
             np.testing.assert_allclose(frame[:3, 1], axes[:, 2], atol=1e-10)
-    scene = small(*chain.manipulators(1.0), kinematics=chain)
+    scene = small(*link_manipulators(chain, 1.0), kinematics=chain)
     found = JointActions([scene]).frames(torch.tensor(joints)[None, None])[0, 0]
     np.testing.assert_allclose(mount @ found.numpy(), frames, atol=1e-12)
 
@@ -125,7 +125,7 @@ def arm(device: str) -> Simulator:
     scenes = []
     for place in ((0.28, 0.0, 0.5), (0.27, 0.01, 0.49)):
         chain = placed(True, place, start=start, together={"grip": "left|right"})
-        scenes.append(small(ball, *chain.manipulators(0.8), kinematics=chain))
+        scenes.append(small(ball, *link_manipulators(chain, 0.8), kinematics=chain))
     terms = make_terms({"sdf": 10.0, "contact": 1.0})
     simulator = Simulator(scenes, terms=terms, precision="float64", device=device)
     sdf = np.random.default_rng(1).random((2, 16, 16, 16))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from plab.config import build_scene, load_config
-from plab.laws import LAWS, Law, find_law
-from plab.scenes import Material
+from plab.laws import Law
+from plab.scenes import LAWS, Material, find_law
 from plab.sim import DeviceError
 from plab.sim.codegen import bitcode
 from plab.sim.compiler import ti

@@ -11,9 +11,8 @@ import torch
 
 import reference_mpm as reference
 import suite
-from plab.laws import LAWS
 from plab.losses import make_terms
-from plab.scenes import Body, Scene
+from plab.scenes import LAWS, Body, Scene
 from plab.sim import Simulator, State
 
 WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}

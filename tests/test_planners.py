@@ -23,15 +23,14 @@ from plab.runners.planners import planner
 from plab.runners.planners.planner import (
     Answer,
     CandidateStart,
-    Preview,
     Request,
     make_planner,
 )
-from plab.runners.planners.samplers import actions_of, knots_of
+from plab.runners.planners.searches import actions_of, knots_of
 from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles
-from plab.sweep.plan import plan
+from plab.sweep.running import plan
 from same_runs import assert_same_numbers
 
 # ---------------------------------------------------------------- rules, on a quadratic loss
@@ -65,7 +64,7 @@ def judged(request: Request, broken: Sequence[int] = ()) -> Answer:
     return Answer(measures, final, 2.0 * away if request.gradient else None, lost)
 
 
-def iterate(search, iteration: int, broken: Sequence[int] = ()) -> tuple[list[Request], Preview]:
+def iterate(search, iteration: int, broken: Sequence[int] = ()) -> tuple[list[Request], tuple]:
     """Requests of one iteration, and the best of it."""
     walk, requests = search.plan(random(iteration)), []
     answer = None
@@ -164,7 +163,7 @@ def test_multistart_descends_with_adam_and_replaces_the_worse_half() -> None:
         for steps, request in zip((0, 0, 1), requests, strict=True):
             torch.testing.assert_close(request.actions, descended(start, 2 * iteration + steps))
         shown = judged(requests[0])
-        assert best.measures["score"] == float(shown.measures["score"].max())
+        assert best[1]["score"] == float(shown.measures["score"].max())
     # Three of five stay, with their moments; one is beside the best of them, one is drawn afresh.
     order = shown.measures["loss"].argsort().tolist()
     requests, _ = iterate(search, 2)
@@ -185,10 +184,10 @@ def test_stages_begin_from_the_best_of_the_stage_before() -> None:
     stages = make_planner(method, START)
     shown = [iterate(stages, 0), iterate(stages, 1)]
     (last,), first = shown[1][0], iterate(stages, 2)[0][0]
-    best = max((one for _, one in shown), key=lambda one: one.measures["score"])
+    best = max((one for _, one in shown), key=lambda one: one[1]["score"])
     # That which scored best of all, the last candidates by their rank, and two drawn afresh.
     order = judged(last).final_loss.argsort()
-    assert torch.equal(first.actions[:3], torch.stack([best.actions, *last.actions[order[:2]]]))
+    assert torch.equal(first.actions[:3], torch.stack([best[0], *last.actions[order[:2]]]))
     torch.testing.assert_close(first.actions[3:], 0.3 * uniform(random(2), 2))
     # A search takes over the better half of what it has room for.
     found = 0.3 * uniform(random(7), 4)
@@ -201,7 +200,7 @@ def test_a_search_in_soft_contact_shows_the_better_half_in_the_hard_model() -> N
     (soft, hard), best = iterate(search, 0)
     assert (soft.softness, hard.softness, soft.gradient, hard.gradient) == (300, None, False, False)
     order = judged(soft).final_loss.argsort()
-    assert torch.equal(hard.actions, soft.actions[order[:2]]) and torch.equal(best.actions, hard.actions[0])
+    assert torch.equal(hard.actions, soft.actions[order[:2]]) and torch.equal(best[0], hard.actions[0])
 
 
 def test_costs_and_curves() -> None:

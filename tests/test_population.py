@@ -22,9 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from torch.distributions import normal
 
 from plab.config import Config, load_config
-from plab.runners.agents import Agents, OffPolicyConfig
+from plab.runners.agents import Agents, OffPolicyConfig, ReplayBuffer, Sizes
 from plab.runners.policy import CLIP, Spaces, first_policy, torch_settings
-from plab.runners.replay import ReplayBuffer, Sizes
 from plab.runners.rl import agents_of
 from plab.runners.sb3 import off_policy
 

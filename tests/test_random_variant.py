@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from plab.config import ConfigError, TaskConfig, choices, load_config
 from plab.config.compose import compose
-from plab.config.variants import FIRST_TARGET_SEED, draw_variant
+from plab.config.draws import FIRST_TARGET_SEED, draw_variant
 
 SCENES = 12
 """Draws of each task, of which the least and the largest are more than half of a range apart."""
@@ -106,7 +106,7 @@ def test_refusals():
         ("+task.random.shift={low: [0,0], high: [0,0]}", "task.random.shift.low"),
         (f"{pillar}.low=[0,0]", f"{pillar}.high"),
         (f"{pillar}.low=[1,0,0]", f"{pillar}: low"),
-        (f"{pillar}.keys=[bodies.rop.center]", "task.bodies.rop.center"),
+        (f"{pillar}.keys=[bodies.rop.center]", "task.bodies.rop"),
         (f"{pillar}.keys=[yield_stress]", "task.yield_stress"),
         ("task.target.radius=0.6", "seed_scene=0"),
     ):

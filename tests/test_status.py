@@ -18,7 +18,7 @@ from plab.cli.status import main
 from plab.config.selection import select
 from plab.results.running import acquire
 from plab.status import NAMES, STATES, survey, view
-from plab.status.view import duration, watch
+from plab.status.view import watch
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:
@@ -131,11 +131,6 @@ def test_forms_of_output(folder: Path, told, capsys) -> None:
     assert [row[name] for name in names] == ["Rope", "adam", "3", "2", "1"]
     for wrong in ("tusk=Rope", "/nowhere/at/all"):
         assert wrong in told([wrong], main)
-
-
-def test_durations() -> None:
-    texts = {None: "?", 45.4: "45 s", 12000: "3 h 20 min", 187200: "2 d 4 h"}
-    assert {seconds: duration(seconds) for seconds in texts} == texts
 
 
 def test_all_runs_of_a_sweep_are_shown_until_they_have_ended(folder: Path, monkeypatch) -> None:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-import plab.sweep.plan as planning
+import plab.sweep.running as planning
 import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
@@ -18,8 +18,7 @@ from plab.results import RunFile, read
 from plab.results.running import acquire
 from plab.runners.tracks import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
-from plab.sweep.plan import plan
-from plab.sweep.running import compose_jobs, look_up
+from plab.sweep.running import compose_jobs, look_up, plan
 from same_runs import raising
 from toy_runner import COARSE, WHY, assert_complete, computed, configs
 

@@ -7,18 +7,14 @@ import io
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from plab import progress
 from plab.cli.run import main
-from plab.config import load_config
 from plab.results import RunFile
 from plab.results import read as read_result
-from plab.runners.tracks import Track
 from plab.sim import compiler
 from plab.sim.compiler import watch_compiling
 
@@ -69,34 +65,3 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     assert f"plab render {score.rpartition(' ')[2]};" in hint
     assert main([*argv, "progress=false"]) == 0
     assert capsys.readouterr().out == f"finished before: {score.partition(': ')[2]}\n"
-
-
-def summary(folder: Path, shown: float, judged: float, *words: str, **more: float) -> str:
-    """Summary of a run whose best iteration has one score, and whose final evaluation another."""
-    cfg = load_config([*words, f"results_dir={folder}"])
-    run = RunFile(cfg)
-    row = {"iteration": 0, "episodes": 0, "steps": 0, "loss": 1.5, "reward": 2.0, "iou": 0.4, "score": shown}
-    run.record(row | more, {}, best_actions=np.zeros((50, 6)), best_iteration=0, best_loss=1.5)
-    numbers = dict.fromkeys(("loss", "reward", "iou", "score_printed", "iou_initial", "iou_target_self"), 0.5)
-    run.finish(numbers | {"score": judged}, {})
-    return Track(cfg, run).summary_line
-
-
-@pytest.mark.parametrize(
-    ("shown", "judged", "words", "more", "scores"),
-    [
-        (0.734, 0.6132, (), {}, ["0.6132", "0.7340"]),
-        (0.61324, 0.61321, (), {}, ["0.6132"]),
-        (0.7, 0.6132, ("method=adam_h",), {}, ["0.6132"]),
-        (0.7, 0.6132, ("method=cem",), {}, ["0.6132"]),
-        # The release's score: of the last iteration, of a policy of its training.
-        (0.7, 0.6, ("protocol=release",), {}, ["0.7000"]),
-        (0.7, 0.6, ("protocol=release", "method=ppo"), {"train_score": 0.5}, ["0.5000", "0.7000"]),
-        (0.7, 0.6, ("protocol=release", "method=ppo"), {"train_score": np.nan}, ["0.7000"]),
-    ],
-)
-def test_the_summary_has_the_score_and_another_one_if_it_differs(
-    tmp_path, shown, judged, words, more, scores
-) -> None:
-    columns = {"train_reward": 1.0} | more if more else {}
-    assert re.findall(r"\d\.\d+", summary(tmp_path, shown, judged, *words, **columns)) == scores

@@ -28,9 +28,8 @@ from plab import config
 from plab.config.suite import conf_folder
 from plab.runners.agents import OffPolicyConfig, RlConfig
 from plab.runners.apg import ApgConfig
-from plab.runners.planners.multistart import MultistartConfig
 from plab.runners.planners.planner import PlannerConfig, StagesConfig
-from plab.runners.planners.samplers import CemConfig, MppiConfig, SamplerConfig
+from plab.runners.planners.searches import CemConfig, MppiConfig, MultistartConfig, SamplerConfig
 from plab.runners.ppo import PpoConfig
 from plab.runners.shac import ShacConfig
 from plab.runners.td3 import Td3Config
@@ -73,7 +72,7 @@ PYTHON = {
             "plab.envs.sb3",
             "plab.envs.tensors",
             "plab.envs",
-            "plab.submissions",
+            "plab.submissions.recorder",
         ),
     ),
     "results": (

@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections import UserDict
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from plab.errors import ConfigError
 
@@ -29,6 +30,26 @@ class LazyModule(ModuleType):
         value = getattr(import_module(self.__name__), name)
         setattr(self, name, value)
         return value
+
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = LazyModule("torch")
+
+
+class Registry(UserDict[str, Any]):
+    """Objects by name, each given as ``module:NAME`` and imported when it is first asked for."""
+
+    def __init__(self, kind: type, places: Mapping[str, str]) -> None:
+        """Keep the places of instances of ``kind``; ``type`` for classes."""
+        super().__init__(places)
+        self._kind = kind
+
+    def __getitem__(self, name: str) -> Any:
+        if isinstance(self.data[name], str):
+            self.data[name] = load_object(self.data[name], self._kind)
+        return self.data[name]
 
 
 def search_in(config_dir: str | Path) -> None:

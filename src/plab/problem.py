@@ -39,19 +39,6 @@ if TYPE_CHECKING:
 
     from plab.scenes import Scene
 
-__all__ = [
-    "BatchMeasures",
-    "Episodes",
-    "Problem",
-    "build_scenes",
-    "fits",
-    "kinds_of",
-    "make_simulator",
-    "make_targets",
-    "target_distance",
-]
-
-
 _log = logging.getLogger(__name__)
 
 
@@ -300,6 +287,24 @@ class Problem:
         tensors."""
         return batch_scores(self._scale.like(iou), iou)
 
+    def totals(self, terms: Any, loss: Any, first_loss: Any, iou: Any) -> dict[str, float]:
+        """Return the measures of one episode, as in the columns of results; of arrays or tensors.
+
+        Args:
+            terms: Its terms after each step, shape [T, term].
+            loss: Its step losses, shape [T].
+            first_loss: Loss of its initial state.
+            iou: Soft IoUs of the last states, shape [batch]; that of the episode is the first.
+        """
+        sums = zip(self.term_names, terms.sum(0).tolist(), strict=True)
+        return {
+            "loss": float(loss.sum()),
+            **{f"loss_{name}": total for name, total in sums},
+            "reward": float((first_loss - loss).sum()),
+            "iou": float(iou[0]),
+            "score": float(self.scores_of(iou)[0][0]),
+        }
+
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
         """Run actions from the initial states, in the current contact model, and total their measures. CUDA
         tensors stay on the device, failures excepted.
@@ -314,10 +319,8 @@ class Problem:
         """
         result = self.simulator.rollout(actions, gradient=gradient, strict=False)
         terms, iou = result.step_terms, result.step_iou[:, -1]
-        loss, reward = (
-            self.loss_of(terms),
-            rewards(result.initial_terms, terms, self._held_weights.like(terms)),
-        )
+        loss = self.loss_of(terms)
+        reward = rewards(result.initial_terms, terms, self._held_weights.like(terms))
         score, _ = self.scores_of(iou)
         # cumsum() adds in order; the order of sum() depends on the number of episodes.
         total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
@@ -417,14 +420,9 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
-    """Refuse configurations that cannot share a simulator."""
-    if isinstance(cfgs, Config):
+    if isinstance(cfgs, Config) or not cfgs:
         raise ConfigError("give a list of configurations, one per environment: [cfg]")
-    if not cfgs:
-        raise ConfigError("there is no configuration: give one per environment, as load_config() makes them")
     for number, cfg in enumerate(cfgs):
-        if not isinstance(cfg, Config):
-            raise ConfigError(f"configurations are what load_config() returns, not {cfg!r}")
         for part in ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets"):
             first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
             if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:

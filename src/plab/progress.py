@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import timedelta
-from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -27,21 +27,8 @@ Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
 """Context that passes the name of each kernel under compilation to a function, and an empty one afterwards;
 such as :func:`plab.sim.compiler.watch_compiling`."""
 
-_forward: Callable[..., None] | None = None
-
 PLAIN_EVERY = 10
 """Default number of steps between two lines where there is no terminal."""
-
-
-def forward_to(forward: Callable[..., None]) -> None:
-    """Let another process show this one's progress from now on.
-
-    Args:
-        forward: Takes ``"progress"`` with title, first step, steps to do, steps between two plain lines,
-            steps done and text; or ``"compiling"`` with the name of a kernel, empty when it is done.
-    """
-    global _forward
-    _forward = forward
 
 
 @contextmanager
@@ -68,52 +55,21 @@ def show_progress(
         Function to call after every step.
     """
     watch, console = compiling or (lambda note: nullcontext()), Console()
-    if enabled and (forward := _forward) is not None:
-        with watch(lambda kernel: forward("compiling", kernel)):
-            yield lambda done, text: forward("progress", title, start, total, plain_every, done, text)
-    elif enabled and console.is_terminal:
+    if enabled and console.is_terminal and multiprocessing.parent_process() is None:
         with Progress(
             *_columns(total), console=console, expand=total is not None, transient=not total
         ) as bars:
             task = bars.add_task(title, total=total, completed=start, text="")
-            with watch(lambda kernel: bars.update(task, text=_compiling(kernel), refresh=bool(kernel))):
+
+            def note(kernel: str) -> None:
+                bars.update(task, text=f"compiling {kernel}" if kernel else "", refresh=bool(kernel))
+
+            with watch(note):
                 yield lambda done, text: bars.update(task, completed=done, text=text)
     elif enabled and total is not None:
         yield _plain(title, start, total, plain_every)
     else:
         yield lambda done, text: None
-
-
-@contextmanager
-def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Callable[..., None]]:
-    """Show how far several processes have come while the ``with`` block lasts, a bar each.
-
-    Yields:
-        Function of one of the ``names`` and the arguments that its process has forwarded.
-    """
-    console = Console()
-    if not (enabled and console.is_terminal):
-        lines: dict[str, Report] = {}
-
-        def say(name: str, kind: str, *content: Any) -> None:
-            if enabled and kind == "progress":
-                title, start, total, every, done, text = content
-                title = f"{name} {title}"
-                lines.setdefault(title, _plain(title, start, total, every))(done, text)
-
-        yield say
-        return
-    with Progress(*_columns(), console=console, expand=True) as bars:
-        tasks = {name: bars.add_task(name, total=None, text="") for name in names}
-
-        def draw(name: str, kind: str, *content: Any) -> None:
-            if kind == "compiling":
-                bars.update(tasks[name], text=_compiling(*content), refresh=True)
-                return
-            title, _start, total, _every, done, text = content
-            bars.update(tasks[name], description=f"{name} {title}", total=total, completed=done, text=text)
-
-        yield draw
 
 
 def show_line(text: str) -> None:
@@ -123,11 +79,7 @@ def show_line(text: str) -> None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
 
-def _compiling(kernel: str) -> str:
-    return f"compiling {kernel}" if kernel else ""
-
-
-def _columns(total: int | None = 1) -> tuple[ProgressColumn, ...]:
+def _columns(total: int | None) -> tuple[ProgressColumn, ...]:
     """Return the parts of the bar; on a narrow terminal the bar itself gives way, then the text."""
     title, text = (
         TextColumn(f"{{task.{part}}}", markup=False, table_column=Column(no_wrap=True))

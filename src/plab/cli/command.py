@@ -14,10 +14,14 @@ from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormat
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
+from plab.config.selection import one_protocol, select
 from plab.config.suite import EXTENSION_TASKS, suite_tasks
 from plab.errors import TRACEBACK, ArgumentError, PlabError, out_of_memory, pick, tell, traceback_wanted
+
+if TYPE_CHECKING:
+    from plab.results import Row
 
 EXIT_BUG, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 70, 130, 141
 """Exit codes of a bug, by sysexits.h, of Ctrl-C, and of a closed pipe."""
@@ -147,6 +151,20 @@ def sources_and_words(
     if not all(one.strip() for one in named):
         raise ArgumentError("the name of a folder is empty: give one, or . for this one")
     return [results_source(one) for one in named or ([default] if default else [])], words
+
+
+def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
+    """Return the finished runs that words choose, all of one protocol; ResultsError if there are none."""
+    from plab.results.schema import ResultsError
+    from plab.results.table import readable_rows
+
+    chosen = select(words, ("task", "variant", "method", "seed"))
+    found, _ = readable_rows(sources)
+    rows = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
+    one_protocol(row.config for row in rows)
+    if not rows:
+        raise ResultsError(f"there is no finished run in {', '.join(map(str, sources))}: no run fits")
+    return rows
 
 
 def positive(text: str, least: int = 1) -> int:

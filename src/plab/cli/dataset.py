@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,11 +15,11 @@ import numpy as np
 import yaml
 from gymnasium.spaces import Dict, Space
 
-from plab.cli.command import Parser, command_line, folder, positive, sources_and_words
+from plab.cli.command import Parser, command_line, finished_rows, folder, positive, sources_and_words
 from plab.cli.tables import print_table
 from plab.config import Config
 from plab.config.compose import check_sources, require_runnable
-from plab.config.selection import OBSERVATION_KEYS, one_protocol, select
+from plab.config.selection import OBSERVATION_KEYS
 from plab.config.suite import SUITE_VARIANTS
 from plab.config.words import parse, prepared
 from plab.demonstrations import known_actions
@@ -28,7 +29,6 @@ from plab.envs.observations import mapped, spaces
 from plab.errors import ArgumentError, tell
 from plab.problem import build_scenes, fits
 from plab.results import read
-from plab.results.table import readable_rows
 from plab.scenes import Camera
 
 REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVATION_KEYS)
@@ -69,23 +69,18 @@ def main(argv: Sequence[str]) -> None:
     add("--output", type=folder, help="folder of datasets: $MINARI_DATASETS_PATH, or datasets, by default")
     add("--name", help="name of the dataset, plab/<Task>-v0 by default")
     add("--observe", default="state", metavar="NAME,...", help="state (default), particles, depth, rgb, ...")
-    add(
-        "--cameras",
-        type=folder,
-        metavar="FILE",
-        help="cameras by name: YAML with position, target, size, ...",
-    )
+    what = "cameras by name: YAML with position, target, size, ..."
+    add("--cameras", type=folder, metavar="FILE", help=what)
     add("--min-score", type=float, default=0.0, metavar="S", help="leave out episodes that score less")
-    add(
-        "--together", type=positive, default=25, metavar="N", help="scenes simulated at a time, 25 by default"
-    )
+    what = "scenes simulated at a time, 25 by default"
+    add("--together", type=positive, default=25, metavar="N", help=what)
     add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for plab run")
     options = parser.parse_intermixed_args(argv)
     output = options.output or Path(os.environ.get("MINARI_DATASETS_PATH") or "datasets")
     cameras = None if options.cameras is None else _cameras(options.cameras)
     observe = options.observe.split(",") if "," in options.observe else options.observe
     found = _demonstrations(options)
-    tasks: dict[str, list[Demonstration]] = {one.cfg.task.name: [] for one in found}
+    tasks: dict[str, list[Demonstration]] = defaultdict(list)
     for one in found:
         tasks[one.cfg.task.name].append(one)
     if options.name and len(tasks) > 1:
@@ -93,7 +88,7 @@ def main(argv: Sequence[str]) -> None:
     rows = []
     for task, own in tasks.items():
         name = options.name or f"plab/{task}-v0"
-        recorder = _Recorder(own, observe, cameras, options.together or 25)
+        recorder = _Recorder(own, observe, cameras, options.together)
         episodes = (one for one in recorder.play() if one.attributes["score"] >= options.min_score)
         about = {
             "algorithm_name": ", ".join(sorted({one.source for one in own})),
@@ -136,15 +131,15 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     require_runnable(cfgs[0])
     if "method" in given:
         return _solved(cfgs, options.together)
-    actions = [known_actions(cfg) for cfg in cfgs]
-    for cfg, own in zip(cfgs, actions, strict=True):
-        if own is None:
+    found = []
+    for cfg in cfgs:
+        if (actions := known_actions(cfg)) is None:
             raise ArgumentError(
                 f"no actions are known for {cfg.task.name}, variant {cfg.variant}: add a method that finds "
                 "some, such as method=adam"
             )
-    pairs = zip(cfgs, actions, strict=True)
-    return [Demonstration(cfg, own, "demonstration") for cfg, own in pairs if own is not None]
+        found.append(Demonstration(cfg, actions, "demonstration"))
+    return found
 
 
 def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
@@ -154,32 +149,17 @@ def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]
     for one in run_batches(cfgs, carry_here, together):
         if not one.finished:
             tell(f"{one.title}: {one.message}")
-    done = [(cfg, read(cfg.path)) for cfg in cfgs if cfg.path.is_file()]
+    done = [(cfg, read(cfg.path).best_actions) for cfg in cfgs if cfg.path.is_file()]
     if not done:
         raise DatasetError("no run has finished")
-    return [
-        Demonstration(cfg, run.best_actions, cfg.method.name)
-        for cfg, run in done
-        if run.best_actions is not None
-    ]
+    return [Demonstration(cfg, best, cfg.method.name) for cfg, best in done if best is not None]
 
 
 def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstration]:
     from plab.render.rollouts import result
 
     parsed = {one.key_or_group: one for one in parse(prepared(words))}
-    chosen = select(
-        [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED],
-        ("task", "variant", "method", "seed"),
-    )
-    rows = [
-        row
-        for row in readable_rows(sources)[0]
-        if row.values["status"] == "finished" and chosen(row.values, row.config)
-    ]
-    one_protocol(row.config for row in rows)
-    if not rows:
-        raise DatasetError(f"there is no finished run in {', '.join(map(str, sources))}: no run fits")
+    rows = finished_rows(sources, [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED])
     changes = {key: one.value() for key, one in parsed.items() if key in REPLAYED}
     # Without a gradient the budget of memory has no effect, but all have to have the same.
     sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}

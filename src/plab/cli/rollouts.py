@@ -9,11 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plab.cli.command import Parser, command_line, folder, positive, require_writable, sources_and_words
+from plab.cli.command import (
+    Parser,
+    command_line,
+    finished_rows,
+    folder,
+    positive,
+    require_writable,
+    sources_and_words,
+)
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
 from plab.config.run import RUN_ONLY_KEYS
-from plab.config.selection import one_protocol, select
 from plab.config.suite import EXTENSION_TASKS
 from plab.config.words import require_effect
 from plab.errors import ArgumentError
@@ -119,20 +126,20 @@ def view(argv: Sequence[str]) -> None:
     require_writable(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     from plab.render.rollouts import demonstration, record_with_motion
-    from plab.results.run_file import replace_file
     from plab.view.page import gallery, page
 
+    output.parent.mkdir(parents=True, exist_ok=True)
     if options.gallery:
         pages = []
         for task, (cfg,) in _of_all_tasks(options, variants=False):
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
             shown = page(recording, options.every, surface=options.surface)
-            replace_file(output.with_name(file), shown)
+            output.with_name(file).write_text(shown, encoding="utf-8")
             pages.append((task, file, recording.score))
-        replace_file(output, gallery(pages))
+        output.write_text(gallery(pages), encoding="utf-8")
     else:
         shown = page(record_with_motion(*rollout(options)), options.every, surface=options.surface)
-        replace_file(output, shown)
+        output.write_text(shown, encoding="utf-8")
     print(output)
 
 
@@ -163,12 +170,11 @@ def export(argv: Sequence[str]) -> None:
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
     from plab.export.files import write_ply, write_vtk
-    from plab.files import complete_folder
     from plab.render.rollouts import record_with_motion
 
     recording = record_with_motion(*rollout(options))
-    with complete_folder(output) as fresh:
-        (write_vtk if options.format == "vtk" else write_ply)(recording, fresh, options.every or 1)
+    output.mkdir(parents=True, exist_ok=True)
+    (write_vtk if options.format == "vtk" else write_ply)(recording, output, options.every or 1)
     print(output)
 
 
@@ -227,18 +233,10 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
 
 def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
     """Return place and name of the finished run with the highest score, of those that the words choose."""
-    from plab.results.table import readable_rows
-
-    names = ("task", "variant", "method", "seed")
-    chosen = select(words, names)
-    found, _ = readable_rows(sources)
-    rows = [r for r in found if r.values["status"] == "finished" and chosen(r.values, r.config)]
-    one_protocol(row.config for row in rows)
-    if not rows:
-        raise RenderError(f"there is no finished run to show in {', '.join(map(str, sources))}: no run fits")
     # Of runs with the same score the one that the page of results shows.
+    rows = finished_rows(sources, words)
     best = min(rows, key=lambda row: (-row.values["score"], row.values["config_hash"]))
-    task, variant, method, seed = (best.values[name] for name in names)
+    task, variant, method, seed = (best.values[name] for name in ("task", "variant", "method", "seed"))
     return best.path, f"{task}-v{variant}-{method}-seed{seed}"
 
 

@@ -8,10 +8,8 @@ OmegaConf.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import pickle
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -28,11 +26,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.draws import with_own_materials
 from plab.config.families import family
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.config.words import COMPOSE_ERRORS, explain, parse, prepared, quoted
+from plab.config.words import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3
@@ -54,9 +51,6 @@ class _Composed(Config):
 
 ConfigStore.instance().store(name="plab_schema", node=_Composed)
 
-
-RANDOM = "random"
-"""Name of the variant that is drawn instead of looked up."""
 
 TABLES = {
     "lr_by_task": "numbers",
@@ -113,10 +107,6 @@ def load_config(
     """
     words = prepared(overrides)
     check_overrides(words, config_dir)
-    if several := [one.input_line for one in parse(words) if one.is_sweep_override()]:
-        raise ConfigError(
-            f"'{several[0]}' gives several values: add -m to run each, or write [a,b] for a list"
-        )
     return finish(compose(words, config_dir), words, alone=alone)
 
 
@@ -182,9 +172,10 @@ def _without_hydra(composed: DictConfig) -> DictConfig:
 
 
 def _sets_a_value(override: Override) -> bool:
-    """Return whether an override is ``key=value``: no choice of files, addition, removal or Hydra's key."""
+    """Return whether an override is ``key=value``: no sweep, choice of files, addition or removal."""
     group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
-    return override.type is OverrideType.CHANGE and not group and not override.is_hydra_override()
+    other = group or override.is_sweep_override() or override.is_hydra_override()
+    return override.type is OverrideType.CHANGE and not other
 
 
 def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
@@ -199,8 +190,16 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
         ConfigError: If a group is not given exactly one choice, or the folder cannot be used.
     """
     if config_dir is not None:
-        _check_config_dir(config_dir)
-        search_in(Path(config_dir).expanduser())
+        folder = Path(config_dir).expanduser()
+        if not str(config_dir).strip() or not folder.is_dir():
+            raise ConfigError(f"config folder '{config_dir}' does not exist")
+        for path in (path for group in (*GROUPS, EXPERIMENT) for path in (folder / group).glob("*.yaml")):
+            # Hydra would ignore it.
+            if path.stem in choices(path.parent.name):
+                raise ConfigError(
+                    f"{path}: plab has a {path.parent.name} of this name, give the file another one"
+                )
+        search_in(folder)
     for override in parse(words):
         key, text = override.key_or_group, str(override.input_line)
         if key not in (*GROUPS, EXPERIMENT) or override.package is not None:
@@ -209,22 +208,6 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
             raise ConfigError(f"'{text}': write {'+' * (key == EXPERIMENT)}{text.lstrip('+')}")
         if not isinstance(override.value(), str) and (key == EXPERIMENT or not override.is_sweep_override()):
             raise ConfigError(f"'{text}': name one {key}; choose from: {', '.join(choices(key, config_dir))}")
-
-
-def _check_config_dir(config_dir: str | Path) -> None:
-    """Raise ConfigError for a missing folder, files that are not text, and files with names of plab's own
-    files, which Hydra would ignore."""
-    folder = Path(config_dir).expanduser()
-    if not str(config_dir).strip() or not folder.is_dir():
-        raise ConfigError(f"config folder '{config_dir}' does not exist")
-    for group in (*GROUPS, EXPERIMENT):
-        for path in (folder / group).glob("*.yaml"):
-            if path.stem in choices(group):
-                raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
-            try:
-                path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError):
-                raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
 
 
 def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = True) -> Config:
@@ -280,6 +263,8 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     Raises:
         ConfigError: If the task is not one of the suite as it stands in its file, or has nothing to draw.
     """
+    from plab.config.draws import with_own_materials
+
     name, own = cfg.task.name, [f"variant={cfg.variant}"]
     if cfg.seed_scene is not None:
         own = ["variant=random", f"seed_scene={cfg.seed_scene}"]
@@ -355,22 +340,14 @@ def check_sources(cfg: Config) -> None:
 
 def require_runnable(cfg: Config) -> None:
     """Raise ConfigError unless this computer has the device and the optional packages that a run uses."""
+    # Imported here: Taichi takes a second.
+    from plab.sim.runtime import cuda_devices
+
     if cfg.sim.device == "cuda" and not cuda_devices():
         raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
     if cfg.logger != "none" and find_spec(cfg.logger) is None:
         name = {"tensorboard": "TensorBoard", "wandb": "Weights & Biases"}[cfg.logger]
         raise ConfigError(f"logger={cfg.logger} needs {name}: pip install 'plab[{cfg.logger}]'")
-
-
-def cuda_devices() -> int:
-    """Return the number of CUDA devices, as the driver counts them: there is no library to import."""
-    count = ctypes.c_int(0)
-    try:
-        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    except OSError:
-        return 0
-    answered = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
-    return count.value if answered else 0
 
 
 # ---------------------------------------------------------------------------------------------------- details
@@ -467,7 +444,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     """Put the variant into the task, drawn if it is to be random, and forget the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
-        from plab.config.variants import draw_variant
+        from plab.config.draws import draw_variant
 
         drawn = draw_variant(task, composed.seed_scene)
         _refuse_undone(overrides, drawn, "variant=random")
@@ -476,32 +453,12 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     else:
         _refuse_undone(overrides, variant_changes(task, name), f"variant={name}", f"task.variants.{name}")
         composed.seed_scene = None
-    merge_variant(task, composed.variant)
-
-
-def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return the changes of a variant, given a task with all its variants; ConfigError if there is no such
-    variant."""
-    if name not in task.variants:
-        names = [*task.variants, *([RANDOM] if task.random else [])]
-        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
-        raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
-    changes = task.variants[name]
-    if not isinstance(changes, DictConfig):
-        expected = "a part of the task's structure, or {}"
-        raise ConfigError(f"variant {name} of task {task.name} must be {expected}, not {changes}")
-    return changes
-
-
-def merge_variant(task: DictConfig, name: str) -> None:
-    """Merge a variant over a task, which has all its variants, and leave no other; ConfigError if it does
-    not exist or does not fit."""
-    changes = variant_changes(task, name)
+    changes = variant_changes(task, composed.variant)
     try:
         task.merge_with(changes)
     except OmegaConfBaseException as error:
-        raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
-    task.variants, task.random = {name: changes}, {}
+        raise ConfigError(f"variant {composed.variant} of task {task.name}: {explain(error)}") from None
+    task.variants, task.random = {composed.variant: changes}, {}
 
 
 def _reject_unknown(node: Any, path: str) -> None:

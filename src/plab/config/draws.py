@@ -1,27 +1,34 @@
-"""Task parameters sampled in every episode, from the ranges of the section ``randomize``.
+"""Numbers of a task that are drawn: those of ``variant=random``, and those of every episode.
 
-The section is a part of the task's structure, as variants are, with a range ``[low, high]`` in place of each
-number or list of numbers: ``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Bodies and
-manipulators have the further key ``offset``, bodies ``yaw``, the task ``observation_noise``; ``scenes: 20``
-draws one of 20 scenes of ``variant=random``.
+``variant=random`` draws once, from the ranges in the task's section ``random``; samples depend only on the
+task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
+
+The section ``randomize``, from which every episode draws anew, is a part of the task's structure, as variants
+are, with a range ``[low, high]`` in place of each number or list of numbers:
+``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Bodies and manipulators have the further
+key ``offset``, bodies ``yaw``, the task ``observation_noise``; ``scenes: 20`` draws one of 20 scenes of
+``variant=random``.
 """
 
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from plab.config.run import Config
+from plab.config.task import RandomConfig, RangeConfig, TaskConfig
+from plab.config.words import explain, variant_changes
 from plab.errors import ConfigError, pick
-from plab.scenes import MATERIAL_KEYS
-
-if TYPE_CHECKING:
-    from plab.config.run import Config
-    from plab.config.task import TaskConfig
+from plab.scenes import MATERIAL_KEYS, Scene, SceneError
+from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
 NOISE, SCENE, SCENES = "observation_noise", "scene", "scenes"
 """Standard deviation of the noise on observations, number of the drawn scene, and how many there are."""
@@ -34,6 +41,9 @@ _FIXED = ("particles", "size", "center", "dt")
 
 Values = dict[str, Any]
 """Drawn numbers and lists of numbers by dotted key of the task."""
+
+
+# ------------------------------------------------------------------------------------------------- episodes
 
 
 def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
@@ -170,3 +180,121 @@ def turned(x: np.ndarray, center: np.ndarray, angle: float) -> np.ndarray:
     sine, cosine = math.sin(angle), math.cos(angle)
     turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return center + (x - center) @ turn.T
+
+
+# ------------------------------------------------------------------------------------------- variant=random
+
+ATTEMPTS = 100
+"""Maximum number of draws until a scene is valid."""
+
+DECIMALS = 4
+"""Number of decimals of sampled numbers, as in the suite's files."""
+
+FIRST_TARGET_SEED = 1000
+"""Drawn seeds of scripted targets are not below this, so that none is that of a variant in a YAML."""
+
+# Entropy besides seed_scene, one per purpose; 0 would be the same as none.
+_NUMBERS, _TARGET_SEED = 1, 2
+
+
+def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
+    """Sample the changes of a random variant, in the structure of the entries of ``variants``.
+
+    Raises:
+        ConfigError: If the task, which has all its variants, does not say what to draw, or none of
+            :data:`ATTEMPTS` draws is valid.
+        OmegaConfBaseException: If the task lacks a value or has one of the wrong type.
+    """
+    if not task.random:
+        raise ConfigError(
+            f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"
+        )
+    if seed_scene is None or seed_scene < 0:
+        raise ConfigError(f"seed_scene must be an integer of at least 0, not {seed_scene}")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(RandomConfig), task.random)
+        random = cast(RandomConfig, OmegaConf.to_object(merged))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"task.random: {explain(error)}") from None
+    random.check("task.random")
+    fixed = OmegaConf.create({})
+    if random.variant is not None:
+        fixed = variant_changes(task, random.variant)
+    base = cast(DictConfig, OmegaConf.merge(task, fixed))
+    base.variants = base.random = {}  # Values that no attempt changes are not copied.
+    if "seed" in base.target.keys():
+        fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}}))
+    rng = np.random.default_rng([seed_scene, _NUMBERS])
+    for _ in range(ATTEMPTS):
+        changes = cast(DictConfig, OmegaConf.merge(fixed, _draw(base, random, rng)))
+        try:
+            _check(cast(TaskConfig, OmegaConf.to_object(OmegaConf.merge(base, changes))), random)
+        except (ConfigError, SceneError, TargetError) as error:
+            flaw = error
+            continue
+        return changes
+    raise ConfigError(
+        f"task {task.name}: none of {ATTEMPTS} draws with seed_scene={seed_scene} is valid; the last: {flaw}"
+    )
+
+
+def _target_seed(seed_scene: int) -> int:
+    # Not Generator.integers: NumPy guarantees that SeedSequence does not change.
+    (word,) = np.random.SeedSequence([seed_scene, _TARGET_SEED]).generate_state(1)
+    return FIRST_TARGET_SEED + int(word) % (2**31 - FIRST_TARGET_SEED)
+
+
+def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> DictConfig:
+    """Draw all ranges and the displacement once; return them as a part of the task's structure."""
+    changes = OmegaConf.create({})
+    for draw in (random.ranges or {}).values():
+        values = _uniform(draw, rng)
+        for key in draw.keys:
+            OmegaConf.update(changes, key, values)
+    if random.shift is not None:
+        displacement = _uniform(random.shift, rng)
+        moving = [name for name, item in base.manipulators.items() if item.scale]
+        places = [f"bodies.{name}.center" for name in base.bodies]
+        places += [f"manipulators.{name}.position" for name in moving]
+        for key in [*places, *(["kinematics.position"] if base.kinematics else [])]:
+            if OmegaConf.select(changes, key) is None:
+                start = OmegaConf.select(base, key, throw_on_missing=True)
+                # Rounding takes off the digits that adding decimals leaves, nothing else.
+                moved = [round(a + b, 12) for a, b in zip(start, displacement, strict=True)]
+                OmegaConf.update(changes, key, moved)
+    return changes
+
+
+def _uniform(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
+    unit = rng.random(len(bounds.low))
+    drawn = [low + u * (high - low) for low, high, u in zip(bounds.low, bounds.high, unit, strict=True)]
+    return np.clip(np.round(drawn, DECIMALS), bounds.low, bounds.high).tolist()
+
+
+def _check(task: TaskConfig, random: RandomConfig) -> None:
+    """Raise the errors of a sampled task, without simulating it."""
+    task.check("task")
+    # The suite's grid and material, because samples must not depend on the run's.
+    scene = Scene(task.name, task.build_bodies(), **task.build_tools())
+    scene.validate()
+    check_target(scene, task.target)
+    recipe = make_recipe(task.target)
+    if isinstance(recipe, BodiesTarget):
+        keys = [key for draw in (random.ranges or {}).values() for key in draw.keys]
+        _check_apart(recipe.bodies, {key.split(".")[2] for key in keys if key.startswith("target.bodies.")})
+        for name in task.bodies.keys() & recipe.bodies.keys() if random.reach is not None else ():
+            way = np.abs(np.subtract(recipe.bodies[name].center, task.bodies[name].center)).max()
+            if way > cast(float, random.reach):
+                raise TargetError(
+                    f"target.bodies.{name} is {way:.3g} away along an axis, beyond reach {random.reach:g}"
+                )
+
+
+def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
+    """Raise if the bounding box of a drawn body of a target overlaps another one's; they may touch."""
+    for (first, a), (second, b) in itertools.combinations(bodies.items(), 2):
+        distance = np.abs(np.subtract(a.center, b.center))
+        overlap = np.all(distance < a.build(1).half_extent() + b.build(1).half_extent() - 1e-9)
+        # Those that are not drawn stick together by intention.
+        if overlap and drawn & {first, second}:
+            raise TargetError(f"target.bodies.{first} overlaps target.bodies.{second}")

@@ -8,13 +8,12 @@ These files import no large library before they need it, so that looking up a re
 from __future__ import annotations
 
 import sys
-from collections import UserDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from plab.errors import ConfigError, pick
-from plab.plugins import load_object
+from plab.plugins import Registry, load_object
 
 RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
@@ -102,26 +101,20 @@ class Family:
         return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
 
 
-class _Registry(UserDict[str, Any]):
-    """Records by name, imported on first access."""
-
-    def __getitem__(self, name: str) -> Family:
-        if isinstance(self.data[name], str):
-            self.data[name] = load_object(self.data[name], Family)
-        return self.data[name]
-
-
-FAMILIES: Mapping[str, Family] = _Registry(
-    trajectory="plab.runners.trajectory:FAMILY",
-    planner="plab.runners.planners:FAMILY",
-    rl="plab.runners.rl:FAMILY",
-    sb3="plab.runners.rl:SB3",
-    apg="plab.runners.apg:FAMILY",
-    pods="plab.runners.pods:FAMILY",
-    shac="plab.runners.shac:FAMILY",
-    bc="plab.runners.bc:FAMILY",
-    mpc="plab.runners.mpc:FAMILY",
-    identify="plab.runners.identify:FAMILY",
+FAMILIES: Mapping[str, Family] = Registry(
+    Family,
+    {
+        "trajectory": "plab.runners.trajectory:FAMILY",
+        "planner": "plab.runners.planners:FAMILY",
+        "rl": "plab.runners.rl:FAMILY",
+        "sb3": "plab.runners.rl:SB3",
+        "apg": "plab.runners.apg:FAMILY",
+        "pods": "plab.runners.pods:FAMILY",
+        "shac": "plab.runners.shac:FAMILY",
+        "bc": "plab.runners.bc:FAMILY",
+        "mpc": "plab.runners.mpc:FAMILY",
+        "identify": "plab.runners.identify:FAMILY",
+    },
 )
 """plab's own families by name, the ``family`` of a method's YAML."""
 

@@ -5,16 +5,25 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plab.config import ranges
-from plab.config.draws import ranges_of
 from plab.errors import ConfigError
 from plab.files import ShapeError, pinned
-from plab.kinematics import Chain, ModelError, locate_model, read_model
-from plab.laws import find_law
-from plab.scenes import MATERIAL_KEYS, Body, Camera, Manipulator, SceneError, make_body
+from plab.scenes import (
+    MATERIAL_KEYS,
+    Body,
+    Camera,
+    Manipulator,
+    SceneError,
+    find_law,
+    link_manipulators,
+    make_body,
+)
 from plab.targets import TargetError, make_recipe
+
+if TYPE_CHECKING:
+    from plab.kinematics import Chain
 
 
 @dataclass
@@ -33,8 +42,8 @@ class BodyConfig(ranges.Section):
         youngs_modulus: Young's modulus E; the task's where it is not given, and so on.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
-        law: Constitutive law: a key of :data:`plab.laws.LAWS`, or ``module:NAME`` of your own; ``von_mises``
-            where it is not given.
+        law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or ``module:NAME`` of your own;
+            ``von_mises`` where it is not given.
         parameters: Other parameters of the law, by name; its defaults where they are not given.
     """
 
@@ -169,22 +178,29 @@ class KinematicsConfig(ranges.Section):
         Raises:
             ConfigError: If the model cannot be read, is another one, or a pattern matches nothing.
         """
+        from plab.kinematics import ModelError
+
         try:
             patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
             return self._read().placed(self.position, self.rotation, self.free, **patterns)
-        except (ModelError, SceneError) as error:
+        except ModelError as error:
             raise ConfigError(f"task.kinematics: {error}") from None
 
     def pin(self) -> None:
         """Replace the model's name by where it is, unless it is in a package, and note its SHA-256; errors as
         of :meth:`build`."""
+        from plab.kinematics import ModelError, locate_model
+
         try:
             self.model = locate_model(self.model)
             self._read()
-        except (ModelError, ShapeError, SceneError) as error:
+        except (ModelError, ShapeError) as error:
             raise ConfigError(f"task.kinematics: {error}") from None
 
     def _read(self) -> Chain:
+        # Imported here, as above: few tasks have an articulated model.
+        from plab.kinematics import ModelError, read_model
+
         chain, digest = read_model(self.model, self.root, self.size, self.omit)
         if self.sha256 not in (None, digest):
             raise ModelError(
@@ -314,7 +330,10 @@ class TaskConfig(ranges.Section):
                 make_recipe(target)
             except TargetError as error:
                 raise ConfigError(f"{path}.{place}{error}") from None
-        ranges_of(self)
+        if self.randomize:
+            from plab.config.draws import ranges_of
+
+            ranges_of(self)
         for name, camera in self.cameras.items():
             try:
                 Camera(**camera)
@@ -340,7 +359,7 @@ class TaskConfig(ranges.Section):
         """Return the scene's ``manipulators`` and ``kinematics``; see :meth:`KinematicsConfig.build`."""
         tools = tuple(manipulator.build() for manipulator in self.manipulators.values())
         chain = self.kinematics.build() if self.kinematics else None
-        links = chain.manipulators(self.kinematics.friction) if chain and self.kinematics else ()
+        links = link_manipulators(chain, self.kinematics.friction) if chain and self.kinematics else ()
         return {"manipulators": tools + links, "kinematics": chain}
 
     def pin_files(self) -> None:

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
@@ -22,6 +21,9 @@ from yaml import MarkedYAMLError, YAMLError
 from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ConfigError, pick
 
+RANDOM = "random"
+"""Name of the variant that is drawn instead of looked up."""
+
 FOLDERS = ("results_dir", "targets.source")
 """Keys with folder names as values."""
 
@@ -30,15 +32,11 @@ _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IG
 
 
 def prepared(words: Sequence[str]) -> list[str]:
-    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``.
-
-    Raises:
-        ConfigError: If they are no list of texts.
-    """
-    given: list[Any] = list(words) if isinstance(words, Iterable) and not isinstance(words, str) else [None]
-    if not all(isinstance(word, str) for word in given):
+    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``;
+    ConfigError for a text in place of a list."""
+    if isinstance(words, str):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
-    return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in given]
+    return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in words]
 
 
 def _quote_path(word: str) -> str:
@@ -102,6 +100,20 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
     return found
 
 
+def variant_changes(task: DictConfig, name: str) -> DictConfig:
+    """Return the changes of a variant, given a task with all its variants; ConfigError if there is no such
+    variant."""
+    if name not in task.variants:
+        names = [*task.variants, *([RANDOM] if task.random else [])]
+        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
+        raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
+    changes = task.variants[name]
+    if not isinstance(changes, DictConfig):
+        expected = "a part of the task's structure, or {}"
+        raise ConfigError(f"variant {name} of task {task.name} must be {expected}, not {changes}")
+    return changes
+
+
 def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None:
     """Raise ConfigError for an override of a key or section without effect on ``what``."""
     for override in parse(prepared(words)):
@@ -153,6 +165,9 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     key = str(error.full_key or error.key)
     last = key.rpartition(".")[2]
     names = [str(name) for name in parent if name != "hydra"] if isinstance(parent, DictConfig) else []
+    if not names:
+        above = key.rpartition(".")[0]
+        return f"unknown key '{key}': {above} has none; if it refers to another key, override that one"
     # lr=0.1 instead of method.lr=0.1: name the key that ends like it.
     deeper = [path for path in _paths(parent) if path.rpartition(".")[2] == last] if "." not in key else []
     if deeper:

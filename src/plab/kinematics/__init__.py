@@ -1,6 +1,6 @@
 """Articulated models: from actions in joint space to twists of rigid links, and the adjoint back."""
 
-from plab.kinematics.chain import Chain, Joint, Link
-from plab.kinematics.models import ModelError, locate_model, read_model
+from plab.kinematics.chain import Chain, Joint, Link, ModelError
+from plab.kinematics.models import locate_model, read_model
 
 __all__ = ["Chain", "Joint", "Link", "ModelError", "locate_model", "read_model"]

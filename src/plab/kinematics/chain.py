@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scenes import Manipulator, SceneError, vector3
+from plab.errors import PlabError
 
 if TYPE_CHECKING:
     from plab.kinematics.actions import JointActions
     from plab.scenes import Scene
 
-__all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "matched", "pose_matrix"]
+__all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "ModelError", "matched", "pose_matrix"]
 
 Matrix = tuple[tuple[float, ...], ...]
 """Homogeneous transform, 4 rows of 4 numbers."""
@@ -34,6 +34,10 @@ BASE_JOINTS = {
     "base_roll": (0.0, 0.0, 1.0),
 }
 """Axes of the joints of a free base: three slides along the world's axes, then three hinges."""
+
+
+class ModelError(PlabError, ValueError):
+    """A model that cannot be read, or not be used; the message is one line that names it."""
 
 
 @dataclass(frozen=True)
@@ -127,18 +131,6 @@ class Chain:
             [(world[k.parent] if k.parent >= 0 else np.eye(4)) @ np.array(k.offset) for k in self.links]
         )
 
-    def manipulators(self, friction: float) -> tuple[Manipulator, ...]:
-        """Links as manipulators of a scene, where they are at t = 0."""
-        from scipy.spatial.transform import Rotation
-
-        frames = self.frames([joint.start for joint in self.joints])
-        turns = Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
-        wide: dict[str, Any] = {"lower_bound": (-1.0,) * 3, "upper_bound": (2.0,) * 3}
-        return tuple(
-            Manipulator(k.shape, k.size, vector3(at.tolist()), tuple(q.tolist()), friction=friction, **wide)
-            for k, at, q in zip(self.links, frames[:, :3, 3], turns, strict=True)
-        )
-
     @staticmethod
     def action_map(scenes: Sequence[Scene]) -> JointActions:
         """Map from actions to twists, for a batch of scenes with chains of one topology."""
@@ -186,7 +178,7 @@ class Chain:
             together: Patterns of joints that one component of the action moves, by its name.
 
         Raises:
-            SceneError: If a pattern matches no joint, a joint starts outside its limits, or nothing moves.
+            ModelError: If a pattern matches no joint, a joint starts outside its limits, or nothing moves.
         """
         turn = pose_matrix((0.0, 0.0, 0.0), rotation)
         base = [
@@ -215,13 +207,13 @@ class Chain:
             low, high = bounds.get(joint.name, (joint.low, joint.high))
             at = starts.get(joint.name, float(np.clip(0.0, low, high)))
             if not low <= at <= high:
-                raise SceneError(
+                raise ModelError(
                     f"start: joint {joint.name} at {at:g} is outside its limits {low:g} .. {high:g}"
                 )
             joints[k] = replace(joint, low=low, high=high, start=at, scale=scales.get(joint.name, 0.0))
         components = list(dict.fromkeys(shared.get(one.name, one.name) for one in joints if one.scale))
         if not components:
-            raise SceneError("scale: no joint moves: give one at least a scale")
+            raise ModelError("scale: no joint moves: give one at least a scale")
         numbered = [
             replace(one, component=components.index(shared.get(one.name, one.name)) if one.scale else 0)
             for one in joints
@@ -254,16 +246,16 @@ class Chain:
 
 
 def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:
-    """Values of a table by names, given by patterns, regular expressions of whole names; SceneError, which
+    """Values of a table by names, given by patterns, regular expressions of whole names; ModelError, which
     begins with ``key``, if one matches no name."""
     found: dict[str, Any] = {}
     for pattern, value in table.items():
         try:
             hits = [name for name in names if re.fullmatch(pattern, name)]
         except re.error as error:
-            raise SceneError(f"{key}: '{pattern}' is not a pattern: {error}") from None
+            raise ModelError(f"{key}: '{pattern}' is not a pattern: {error}") from None
         if not hits:
-            raise SceneError(f"{key}: '{pattern}' matches none of {', '.join(names)}")
+            raise ModelError(f"{key}: '{pattern}' matches none of {', '.join(names)}")
         found |= dict.fromkeys(hits, value)
     return found
 

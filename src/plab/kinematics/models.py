@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from plab.errors import PlabError
 from plab.files import pinned
-from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, matched, pose_matrix
+from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, ModelError, matched, pose_matrix
 
-__all__ = ["ModelError", "locate_model", "read_model"]
+__all__ = ["locate_model", "read_model"]
 
 CAPSULE_RATIO = 1.5
 """A mesh is fitted by a capsule if the shorter edges of its oriented bounding box have at most this ratio, by
@@ -23,10 +22,6 @@ that box otherwise."""
 
 # Quaternions from the frame of a shape about y to that of a geom about x, y or z.
 _ALONG = ((0.5**0.5, 0.0, 0.0, -(0.5**0.5)), (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.5**0.5, 0.0, 0.0))
-
-
-class ModelError(PlabError, ValueError):
-    """A model that cannot be read, or not be used; the message is one line that names it."""
 
 
 def read_model(
@@ -48,8 +43,8 @@ def read_model(
         its numbers.
 
     Raises:
-        ModelError: If `mujoco`, the file, or the body is missing, or something in it is not supported.
-        plab.scenes.SceneError: If a pattern matches nothing.
+        ModelError: If `mujoco`, the file, or the body is missing, something in it is not supported, or a
+            pattern matches nothing.
     """
     package, colon, inside = model.partition(":")
     path = model

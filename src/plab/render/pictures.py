@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -15,13 +16,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from plab.config import Config, ConfigError
-from plab.files import UNFINISHED, complete_folder
 from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
 from plab.render.rollouts import RecordedRollout, record, record_all, result
-from plab.results import ResultsError
 from plab.scenes import Camera, SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError
@@ -42,10 +41,8 @@ _SET_EVERY = 2  # environment steps from one frame to the next, of a set
 
 
 _PAGE_SIZE = (480, 360)
-_RENDER_ERRORS = (
-    *(RenderError, ResultsError, ConfigError, SceneError, TargetError),
-    *(DeviceError, SimulationError),
-)
+_UNFINISHED = ".unfinished-"
+_RENDER_ERRORS = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
 
 
 Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
@@ -144,8 +141,9 @@ def save_contact_sheet(
             at = left + column * (2 * width + gap)
             sheet.paste(_start_and_target(recording, (width, height)), (at, top))
             _write(sheet, recording.variant, (at + width, top + height + text // 2), text)
+    image = _with_palette(sheet, _palette([np.asarray(sheet)], _SHEET_COLORS))
     with _writing(path) as fresh:
-        _with_palette(sheet, _SHEET_COLORS).save(fresh, optimize=True)
+        image.save(fresh, optimize=True)
 
 
 def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> Image.Image:
@@ -193,16 +191,15 @@ def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
     """Create the folder of a file, and yield a temporary path that replaces the file on success."""
-    fresh = path.with_name(f"{UNFINISHED}{path.name}")
+    fresh = path.with_name(f"{_UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield fresh
         if fresh.exists():
             fresh.replace(path)
     except OSError as error:
-        raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
         fresh.unlink(missing_ok=True)
+        raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 # ---------------------------------------------------------------------------------------------------- formats
@@ -229,9 +226,8 @@ def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path:
 def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     frames = list(_frames(recording, renderer, every))
     # One palette for all frames, so that unchanged parts compress well.
-    some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
-    palette = _with_palette(Image.fromarray(some), _FILM_COLORS)
-    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    palette = _palette([frames[0], frames[len(frames) // 2], frames[-1]], _FILM_COLORS)
+    images = [_with_palette(Image.fromarray(frame), palette) for frame in frames]
     duration = [1000 * every // STEPS_PER_SECOND] * (len(images) - 1) + [round(1000 * _HOLD)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
 
@@ -248,11 +244,6 @@ def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: 
             writer.send(np.ascontiguousarray(frame))
         for _ in range(round(_HOLD * STEPS_PER_SECOND / every) - 1):
             writer.send(np.ascontiguousarray(frame))
-    try:
-        imageio_ffmpeg.count_frames_and_secs(str(path))
-    except RuntimeError:
-        # ffmpeg leaves a part of the film without an error.
-        raise OSError("the film is incomplete: is the disk full?") from None
 
 
 _WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
@@ -264,8 +255,17 @@ def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Itera
         yield renderer.frame(recording.x[step], recording.poses[step])
 
 
-def _with_palette(picture: Image.Image, colors: int) -> Image.Image:
-    return picture.quantize(colors, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
+def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
+    """Return a picture with a common palette for all pictures, each of shape [row, column, 3]."""
+    pixels = np.concatenate([picture.reshape(-1, 3) for picture in pictures])
+    seen, counts = np.unique(pixels, axis=0, return_counts=True)
+    # By the root of how often a colour is seen: paper is everywhere, yet clay needs its shades, too.
+    weighted = np.repeat(seen, np.ceil(np.sqrt(counts)).astype(int), axis=0)
+    return Image.fromarray(weighted[None]).quantize(colors, method=Image.Quantize.MEDIANCUT, kmeans=1)
+
+
+def _with_palette(picture: Image.Image, palette: Image.Image) -> Image.Image:
+    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 def _write(sheet: Image.Image, text: str, center: tuple[int, int], size: int) -> None:
@@ -292,7 +292,7 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
     troubles: list[str] = []
     for place in {folder.parent for folder in wanted}:
         # Leftover pictures of killed processes.
-        for folder in place.glob(f"{UNFINISHED}*"):
+        for folder in place.glob(f"{_UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
         done = 0
@@ -303,7 +303,7 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
                 troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
                 continue
             for folder in folders:
-                with complete_folder(folder) as fresh:
+                with _complete_or_not(folder) as fresh:
                     films = {name for name, (_, film) in wanted[folder].items() if film}
                     save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _PAGE_SIZE, films)
                 done += 1
@@ -354,3 +354,19 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
         actions = np.stack([actions for _, _, actions in cases])
         made |= zip(names, record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
     return made
+
+
+@contextmanager
+def _complete_or_not(folder: Path) -> Iterator[Path]:
+    """Give a folder to write to, which takes its place only if nothing goes wrong."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder.parent))
+    except OSError as error:
+        raise RenderError(f"cannot write {folder}: {error.strerror or error}") from error
+    try:
+        yield fresh
+        fresh.chmod(0o755)
+        fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)

@@ -14,13 +14,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.config.compose import cuda_devices
 from plab.errors import tell
 from plab.problem import Problem, build_scenes, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scenes import Scene
 from plab.sim import Simulator, State
+from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
 
 Section = TypeVar("Section")

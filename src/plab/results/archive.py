@@ -86,12 +86,7 @@ def pack(
         )
     members = []
     for name, row in sorted(chosen.items()):
-        try:
-            run = read(row.path)
-        except ResultsError as error:
-            # Of its mass tensors or its state: rows are read without them.
-            unreadable.append(error)
-            continue
+        run = read(row.path)
         run = replace(
             run if digits is None else _rounded(run, digits),
             # A path of the computer that made it means nothing elsewhere.
@@ -102,7 +97,7 @@ def pack(
         members.append((name, encode(run, compress=False)))
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
-    replace_file(archive, content, sync=True)
+    replace_file(archive, content, sync=True, folders=True)
     return ArchiveSummary(len(members), len(content), size, unreadable)
 
 
@@ -156,7 +151,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
             raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
         if path.exists():
             continue
-        replace_file(path, encode(read(row.path), compress=True))
+        replace_file(path, encode(read(row.path), compress=True), sync=False, folders=True)
         written += 1
     return written, len(found) - written
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from plab.config.selection import Selection, leaves, lookup
+from plab.config.selection import Selection, lookup
 from plab.errors import ArgumentError
 from plab.results.schema import ResultsError
 from plab.results.table import COLUMNS, Row, read_curves, readable_rows, sources_of, warn_of
@@ -155,7 +155,7 @@ def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataF
         values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
         values["folder"] = next(str(one) for one in sources if row.path.is_relative_to(one))
         rows["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
-        for key, value in leaves(row.config):
+        for key, value in _leaves(row.config, ""):
             number = float(value) if isinstance(value, int | float) else None
             plain = value is None or isinstance(value, str)
             rows["config"].append((run, key, value if plain else json.dumps(value), number))
@@ -169,6 +169,15 @@ def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataF
     tables["runs"] = tables["runs"].astype(types)
     tables["config"] = tables["config"].astype({"number": "float64"})
     return tables
+
+
+def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys of a configuration with their values."""
+    if not isinstance(node, Mapping):
+        yield key, node
+        return
+    for name, value in node.items():
+        yield from _leaves(value, f"{key}.{name}" if key else name)
 
 
 def _value(row: Row, name: str) -> Any:

@@ -54,12 +54,12 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
     if track.error is not None:
         raise track.error
     before = "finished before" if track.finished_before else "finished"
-    print(f"{before}: {track.summary_line}, {track.run.path}")
+    print(f"{before}: score {track.run.result.score:.4f}, {track.run.path}")
     return track.run.result.score
 
 
 def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
-    """Run configurations that fit together; see :func:`plab.sweep.plan`.
+    """Run configurations that fit together; see :func:`plab.sweep.running.plan`.
 
     Runs that have finished before, or that another process computes, are left out.
 
@@ -87,7 +87,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
                 traceback.print_exception(error)
     for track in todo:
         if track.error is None:
-            print(f"finished: {track.summary_line}, {track.run.path}", flush=True)
+            print(f"finished: score {track.run.result.score:.4f}, {track.run.path}", flush=True)
     return [one.outcome() if isinstance(one, Track) else one for one in ended]
 
 

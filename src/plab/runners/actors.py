@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, ranges
-from plab.runners.libraries import torch
+from plab.plugins import torch
 from plab.runners.policy import (
     CLIP,
+    Moments,
     Policy,
     PolicyConfig,
     Spaces,
@@ -127,18 +128,18 @@ class ActorTraining(Training):
         training."""
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
-        policy = Policy(self.network, *self.moments(0))
-        return torch.as_tensor(policy(observations.cpu().numpy()))
+        return torch.as_tensor(Policy(self.network, *self._moments)(observations.cpu().numpy()))
 
-    def policy(self, run: int) -> BasePolicy:
-        return self.network
+    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
+        return self.network, self._moments
 
-    def moments(self, run: int) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def _moments(self) -> Moments:
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
     def freeze_moments(self) -> None:
         """Scale observations by the current moments from here on."""
-        mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self.moments(0))
+        mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self._moments)
         self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
 
     def scaled(self, observations: torch.Tensor) -> torch.Tensor:

@@ -17,13 +17,8 @@ from typing import Any
 from plab.config import MethodConfig, ranges
 from plab.config.draws import without_draws
 from plab.config.families import GRADIENT, Appearance, Family
-from plab.runners.libraries import torch
-from plab.runners.policy import (
-    Spaces,
-    packed,
-    torch_settings,
-    unpacked,
-)
+from plab.plugins import torch
+from plab.runners.policy import Spaces, packed, torch_settings, unpacked
 from plab.runners.runner import Runner, Step, Track
 from plab.runners.training import shared_batches
 
@@ -85,21 +80,13 @@ class ApgRunner(Runner):
         _, before = episode.reset()
         done = policy_gradient(episode, self._policy, episode.horizon)
         actions = done.actions[:, 0].cpu().double().numpy()
-        rewards = before["loss"][0] - done.loss[:, 0].double()
-        last = problem.simulator.measure()
-        sums = zip(problem.term_names, done.terms[:, 0].double().sum(0).tolist(), strict=True)
         gradients = [parameter.grad for parameter in self._policy.parameters()]
         norm = torch.cat([part.flatten() for part in gradients if part is not None]).norm()
         self._optimizer.step()
         self._optimizer.zero_grad()
-        measured = {
-            "loss": float(done.loss.double().sum()),
-            **{f"loss_{name}": total for name, total in sums},
-            "reward": float(rewards.sum()),
-            "iou": float(last.iou[0]),
-            "score": float(problem.scores_of(last.iou)[0][0]),
-            "gradient_norm": float(norm),
-        }
+        terms, loss = done.terms[:, 0].double(), done.loss[:, 0].double()
+        measured = problem.totals(terms, loss, before["loss"][0], problem.simulator.measure().iou)
+        measured["gradient_norm"] = float(norm)
         state = {"policy": self._policy.state_dict(), "optimizer": self._optimizer.state_dict()}
         return Step(measured, actions, {"torch": packed(state)}, steps_forward=0, steps_gradient=len(actions))
 

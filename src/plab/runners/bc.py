@@ -17,8 +17,8 @@ import numpy as np
 
 from plab.config import Config, ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
+from plab.plugins import torch
 from plab.runners.actors import ActorTraining, set_rate
-from plab.runners.libraries import torch
 from plab.runners.policy import PolicyConfig, Spaces
 from plab.runners.runner import Step, Track
 from plab.runners.training import PolicyRunner, shared_batches, whole_cycles

@@ -162,15 +162,8 @@ class IdentifyRunner(Runner):
             simulator.step(np.stack([action] * simulator.batch))
             positions.append(np.asarray(simulator.observe(self._stride))[..., :3])
             terms.append(simulator.measure().terms[0])
-        loss, iou = problem.loss_of(np.array(terms)), simulator.measure().iou
-        sums = zip(problem.term_names, np.array(terms).sum(axis=0).tolist(), strict=True)
-        measured = {
-            "loss": float(loss.sum()),
-            **{f"loss_{name}": total for name, total in sums},
-            "reward": float((first - loss).sum()),
-            "iou": float(iou[0]),
-            "score": float(problem.scores_of(iou)[0][0]),
-        }
+        table = np.array(terms)
+        measured = problem.totals(table, problem.loss_of(table), first, simulator.measure().iou)
         return np.stack(positions, axis=1).astype(np.float64), measured
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family, family
-from plab.runners.libraries import torch
+from plab.plugins import torch
 from plab.runners.planners.planner import (
     Asking,
     CandidateStart,
@@ -136,7 +136,6 @@ class MpcRunner(PlannerRunner):
         return math.ceil(track.cfg.sim.horizon / self._method.execute)
 
     def has_more(self, track: Track) -> bool:
-        """Return whether steps are left."""
         return track.iteration < self.iterations(track)
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
@@ -168,21 +167,20 @@ class MpcRunner(PlannerRunner):
         left = plans[:, len(share) :] if plans.shape[1] > len(share) else plans[:, -1:]
         last = left[:, -1:].expand(-1, method.window - left.shape[1], -1)
         self._found = torch.cat([left, last], dim=1)
-        actions = np.zeros((scene.horizon, scene.action_dim))
+        terms, actions = np.array(self._terms), np.zeros((scene.horizon, scene.action_dim))
         actions[: len(self._executed)] = self._executed
         state = {"executed": self._executed, "found": self._found.cpu().numpy()}
-        yield (
-            track,
-            Step(
-                self._measures(),
-                actions,
-                state,
-                steps_forward=spent[False] + len(share),
-                steps_gradient=spent[True],
-                seconds=time.perf_counter() - begin,
-                whole=len(self._executed) == scene.horizon,
-            ),
+        loss, iou = self.problem.loss_of(terms), self.problem.simulator.measure().iou
+        step = Step(
+            self.problem.totals(terms, loss, self._first_loss, iou),
+            actions,
+            state,
+            steps_forward=spent[False] + len(share),
+            steps_gradient=spent[True],
+            seconds=time.perf_counter() - begin,
+            whole=len(self._executed) == scene.horizon,
         )
+        yield track, step
 
     def close(self) -> None:
         """Return to the beginning, from which the episode is judged."""
@@ -217,20 +215,6 @@ class MpcRunner(PlannerRunner):
 
     def _go_to(self, state: State) -> None:
         self.problem.simulator.set_initial_state(state)
-
-    def _measures(self) -> dict[str, float]:
-        """Return the measures of the steps taken so far."""
-        problem, terms = self.problem, np.array(self._terms)
-        loss = problem.loss_of(terms)
-        iou = problem.simulator.measure().iou
-        sums = zip(problem.term_names, terms.sum(axis=0).tolist(), strict=True)
-        return {
-            "loss": float(loss.sum()),
-            **{f"loss_{name}": total for name, total in sums},
-            "reward": float((self._first_loss - loss).sum()),
-            "iou": float(iou[0]),
-            "score": float(problem.scores_of(iou)[0][0]),
-        }
 
 
 FAMILY = Family(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from plab.runners.libraries import torch
+from plab.plugins import torch
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

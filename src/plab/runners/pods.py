@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
+from plab.plugins import torch
 from plab.runners.actors import ActorConfig, ActorRunner, set_rate, training_scenes
 from plab.runners.bc import Imitation
-from plab.runners.libraries import torch
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -25,9 +25,9 @@ from omegaconf.errors import OmegaConfBaseException
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import FAMILIES, family
 from plab.files import one_line, read_arrays
+from plab.plugins import torch
 from plab.results import ResultsError
 from plab.results.run_file import replace_file
-from plab.runners.libraries import torch
 from plab.scenes import DEVICES
 
 if TYPE_CHECKING:
@@ -41,6 +41,9 @@ CLIP = 10.0
 
 EPSILON = 1e-8
 """Added to variances of observations, as Stable-Baselines3 does."""
+
+Moments: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Means and variances of observations, shape [entry] each, by which they are scaled."""
 
 _FORMAT = "plab-policy 1"
 
@@ -162,7 +165,7 @@ def policy_path(result: Path) -> Path:
 
 
 def save_policy(
-    result: Path, method: PolicyConfig, policy: BasePolicy, moments: tuple[np.ndarray, np.ndarray] | None
+    result: Path, method: PolicyConfig, policy: BasePolicy, moments: Moments | None = None
 ) -> None:
     """Write a policy file beside the result.
 
@@ -170,8 +173,7 @@ def save_policy(
         result: The run's result file.
         method: The section ``method`` of its configuration.
         policy: Stable-Baselines3's policy.
-        moments: Means and variances of the observations that scale them, shape [entry]; None if they were not
-            scaled.
+        moments: Those by which the observations were scaled, if they were.
 
     Raises:
         ResultsError: If the file cannot be written.
@@ -220,7 +222,8 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
 
 def _policy(path: Path) -> Policy:
     arrays = read_arrays(path)
-    header = json.loads(str(arrays["header"][()]))
+    # NumPy's text may hold what is no character.
+    header = json.loads(str(arrays["header"][()]).encode())
     if header["format"] != _FORMAT:
         raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
     method = _method(header["method"], path)

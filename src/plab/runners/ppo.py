@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, cast
 
-import numpy as np
-
 from plab.config import Config, ConfigError, ranges
+from plab.plugins import torch
 from plab.runners.agents import Agents, RlConfig
-from plab.runners.libraries import torch
 from plab.runners.networks import adam, descend, linear, mlp, require_capturable
-from plab.runners.policy import CLIP, EPSILON, Spaces
+from plab.runners.policy import CLIP, EPSILON, Moments, Spaces
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
     from torch import Tensor
 
 ACTION_GAIN = 0.01
@@ -152,10 +150,10 @@ class PpoAgents(Agents):
             cast("torch.nn.Linear", layer).weight.data.mul_(gain)
         return policy
 
-    def moments(self, agent: int) -> tuple[np.ndarray, np.ndarray] | None:
-        if not self.method.normalise:
-            return None
-        return self._seen.mean[agent].cpu().numpy(), self._seen.var[agent].cpu().numpy()
+    def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
+        policy, _ = super().policy(agent)
+        moments = self._seen.mean[agent].cpu().numpy(), self._seen.var[agent].cpu().numpy()
+        return policy, moments if self.method.normalise else None
 
     @classmethod
     def cycle_steps(cls, method: PpoConfig, horizon: int) -> int:
@@ -263,11 +261,9 @@ class PpoAgents(Agents):
 
     @property
     def _size(self) -> int:
-        """Transitions of an agent's rollout."""
         return self.sizes.envs * self._length
 
     def _improve(self) -> None:
-        """Make the updates of a rollout."""
         rows = math.ceil(self._size / self.method.minibatches)
         for _ in range(self.method.epochs):
             for numbers in self.draws.permutation(self._size).split(rows, dim=1):
@@ -275,7 +271,6 @@ class PpoAgents(Agents):
             self.updates += 1
 
     def _decay(self) -> None:
-        """Set the learning rate of the cycle that began with the rollout."""
         if not self.method.lr_decay:
             return
         began = self.steps + self.sizes.envs - self._size

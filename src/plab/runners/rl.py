@@ -18,11 +18,10 @@ import numpy as np
 
 from plab.config import Config
 from plab.config.families import RL, Appearance, Family, Rule, family
-from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, RlConfig
-from plab.runners.libraries import torch
-from plab.runners.policy import Spaces, torch_settings
+from plab.plugins import torch
+from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, RlConfig, Sizes
+from plab.runners.policy import Moments, Spaces, torch_settings
 from plab.runners.ppo import PpoAgents, PpoConfig
-from plab.runners.replay import Sizes
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
 from plab.runners.tracks import RunError
@@ -38,14 +37,6 @@ if TYPE_CHECKING:
 def agents_of(method: RlConfig) -> type[Agents]:
     """Return the agents that learn by a method's algorithm."""
     return family(method.family).rules[method.algorithm].what
-
-
-def population_settings(method: RlConfig) -> AbstractContextManager[None]:
-    """Return torch's settings for a population: on CUDA products of matrices are TF32's.
-
-    The first layers, with 1,200 inputs and more, dominate the time of an update on a GPU.
-    """
-    return torch_settings(method.torch_threads, tf32=method.torch_device == "cuda")
 
 
 class Population(Training):
@@ -139,13 +130,9 @@ class Population(Training):
         if isinstance(stack, OffPolicyAgents):
             stack.replay.read(number, path, stack.steps // self._envs)
 
-    def policy(self, run: int) -> BasePolicy:
+    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
         stack, number = self._places[run]
         return stack.policy(number)
-
-    def moments(self, run: int) -> tuple[np.ndarray, np.ndarray] | None:
-        stack, number = self._places[run]
-        return stack.moments(number)
 
     def _start(self) -> Tensor:
         """Begin the first episodes, or run those of the checkpoint to where it was written; return the
@@ -214,7 +201,8 @@ class RlRunner(PolicyRunner):
     training = Population
 
     def context(self) -> AbstractContextManager[Any]:
-        return population_settings(self.method)
+        # The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
+        return torch_settings(self.method.torch_threads, tf32=self.method.torch_device == "cuda")
 
 
 FAMILY = Family(

@@ -35,9 +35,6 @@ COLUMNS = ("loss", "reward", "iou", "score")
 FINAL_STATE_COLUMNS = ("iou", "score")
 """Columns that refer to the last state; the others are sums over the steps."""
 
-_STATE_ERRORS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
-"""Errors of NumPy and torch for a state with other arrays."""
-
 
 class Runner:
     """Base of runners, which take the runs of a batch from where their files stand to the end.
@@ -57,7 +54,7 @@ class Runner:
     report: Report
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-        """Take over some runs, alike as far as :func:`plab.sweep.plan` asks for; nothing is built yet.
+        """Take over some runs, as alike as :func:`plab.sweep.running.plan` asks for; nothing is built yet.
 
         Args:
             tracks: The runs.
@@ -209,28 +206,22 @@ class Runner:
 
     def _start(self, track: Track) -> None:
         """Start a run, or resume it from its file; reject a state that does not fit this run."""
-        result, scene = track.run.result, self.problem.scenes[0]
+        result = track.run.result
         result.labels = self.problem.labels
         if self._family.batching:
             result.provenance["batch"] = len(self.tracks)
-        best, shape = track.best_actions, (scene.horizon, scene.action_dim)
-        if result.resume is None:
-            self.start(track, None)
-            return
         try:
-            if best is not None and best.shape != shape:
-                raise ValueError(f"the best actions have shape {list(best.shape)}, not {list(shape)}")
             self.start(track, result.resume)
-        except PlabError:
-            raise
-        except _STATE_ERRORS as error:
+        except Exception as error:
+            if result.resume is None or isinstance(error, PlabError):
+                raise
+            # Of NumPy or torch, at a state of other arrays.
             reason, file = " ".join(str(error).split()), track.run.partial_path
             track.fail(
                 ResultsError(f"{file} cannot be gone on from: {reason[:300]}; start afresh with force=true")
             )
 
     def _optimise(self) -> None:
-        """Do the iterations that the files do not hold yet."""
         # The first rollout of a process compiles the kernels.
         phase = "compile"
         with self._progress("", *self.extent()) as self.report:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from plab.config import Config
+from plab.plugins import torch
 from plab.runners.agents import OffPolicyAgents, OffPolicyConfig
-from plab.runners.libraries import torch
 from plab.runners.networks import adam, descend, follow, linear, mlp, twin_values
 from plab.runners.policy import Spaces
 
@@ -83,7 +83,7 @@ class SacAgents(OffPolicyAgents):
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets from some transitions, see
-        :meth:`plab.runners.replay.ReplayBuffer.sample`, with standard normal noise of the actions
+        :meth:`plab.runners.agents.ReplayBuffer.sample`, with standard normal noise of the actions
         and of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)

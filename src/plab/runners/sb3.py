@@ -30,9 +30,8 @@ from plab.config import Config
 from plab.config.families import family
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
-from plab.runners.agents import LARGEST, OffPolicyConfig
-from plab.runners.policy import Policy, Spaces
-from plab.runners.replay import ReplayBuffer, Sizes
+from plab.runners.agents import LARGEST, OffPolicyConfig, ReplayBuffer, Sizes
+from plab.runners.policy import Moments, Policy, Spaces
 from plab.runners.training import PolicyRunner, Training, TrainingSummary
 
 
@@ -83,7 +82,6 @@ class Sb3Training(Training):
 
     Attributes:
         model: The model.
-        episode_actions: Actions of the episodes under way, each of shape [env, A].
     """
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
@@ -104,7 +102,6 @@ class Sb3Training(Training):
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
-        self.episode_actions: list[np.ndarray] = []
         self._ended: list[Mapping[str, Any]] = []
         self._watch = _Watch(self)
         self._set_logger()
@@ -122,14 +119,11 @@ class Sb3Training(Training):
             self._cycle_steps, callback=self._watch, log_interval=None, reset_num_timesteps=False
         )
 
-    def note(self, actions: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> None:
-        """Note a step of training: actions, shape [env, A], and infos."""
+    def note(self, infos: Sequence[Mapping[str, Any]]) -> None:
+        """Note the infos of a step of training."""
         if "episode" in infos[0]:
-            self.episode_actions.clear()
             self._ended += infos
             self.report()
-        else:
-            self.episode_actions.append(np.array(actions))
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
@@ -151,25 +145,14 @@ class Sb3Training(Training):
             "cuda": torch.cuda.get_rng_state() if model.device.type == "cuda" else None,
             "actions": model.action_space.np_random.bit_generator.state,
         }
-        shape = -1, self._sizes.envs, self._sizes.actions
-        return [
-            {
-                "model": np.frombuffer(written.getvalue(), np.uint8),
-                "random": np.frombuffer(pickle.dumps(random), np.uint8),
-                "episode_actions": np.array(self.episode_actions, np.float32).reshape(shape),
-            }
-        ]
+        parts = {"model": written.getvalue(), "random": pickle.dumps(random)}
+        return [{name: np.frombuffer(part, np.uint8) for name, part in parts.items()}]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        # The model, its random numbers, and the episodes that were under way.
-        written = io.BytesIO(state["model"].tobytes())
-        self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
+        # Episodes that were under way begin again.
+        self.model = self._kind.model.load(io.BytesIO(state["model"].tobytes()), self._env, self._device)
         self._set_logger()
         self._envs.next_episode = self.episodes // self._sizes.envs
-        self._env.reset()
-        for actions in state["episode_actions"]:
-            self._env.step(actions)
-            self.episode_actions.append(actions)
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])
@@ -185,8 +168,8 @@ class Sb3Training(Training):
         if self._replay is not None:
             self._replay.kept.read(0, path, self.steps // self._sizes.envs)
 
-    def policy(self, run: int) -> BasePolicy:
-        return self.model.policy
+    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
+        return self.model.policy, None
 
     @property
     def _replay(self) -> _Replay | None:
@@ -246,6 +229,5 @@ class _Watch(BaseCallback):
         self._training = training
 
     def _on_step(self) -> bool:
-        # Algorithms without a replay buffer keep the actions as drawn, and step with clipped ones.
-        self._training.note(self.locals.get("clipped_actions", self.locals["actions"]), self.locals["infos"])
+        self._training.note(self.locals["infos"])
         return True

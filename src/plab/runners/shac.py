@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
+from plab.plugins import torch
 from plab.runners.actors import (
     ActorConfig,
     ActorRunner,
@@ -27,7 +28,6 @@ from plab.runners.actors import (
     actor_policy,
     set_rate,
 )
-from plab.runners.libraries import torch
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:

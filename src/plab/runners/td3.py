@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
 from plab.config import Config, ranges
-from plab.runners.agents import OffPolicyAgents, OffPolicyConfig
-from plab.runners.libraries import torch
+from plab.plugins import torch
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, Samples
 from plab.runners.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.policy import Spaces
-from plab.runners.replay import Samples
 
 if TYPE_CHECKING:
     from stable_baselines3.td3.policies import TD3Policy
@@ -85,7 +84,7 @@ class Td3Agents(OffPolicyAgents):
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update the critics from some transitions, see
-        :meth:`plab.runners.replay.ReplayBuffer.sample`, with standard normal noise of the target
+        :meth:`plab.runners.agents.ReplayBuffer.sample`, with standard normal noise of the target
         policy, shape [agent, row, action]; losses of shape [1, agent]."""
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 

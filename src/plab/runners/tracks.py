@@ -1,10 +1,13 @@
-"""Runs of a batch: tracks, which runners move on, and outcomes, which a sweep reports."""
+"""Runs of a batch: tracks, which runners move on, their logs, and outcomes, which a sweep reports."""
 
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -14,8 +17,6 @@ from plab.config import Config
 from plab.config.families import SOLVED, family
 from plab.errors import TRACEBACK, PlabError, tell, traceback_wanted
 from plab.results import BUDGETS, ResultsError, RunFile
-from plab.results.schema import scores_last_iteration
-from plab.runners.loggers import RunLog
 
 
 class RunError(PlabError, RuntimeError):
@@ -118,24 +119,6 @@ class Track:
     def contact(self) -> str:
         """Contact model in which its rows are measured."""
         return family(self.cfg.method.family).contact or self.cfg.method.contact
-
-    @property
-    def summary_line(self) -> str:
-        """One-line summary of a finished run: its score, and the score of its rows if that differs."""
-        result = self.run.result
-        text = f"score {result.score:.4f}"
-        if scores_last_iteration(result.config):
-            shown = float(result.columns["score"][-1])
-            if "train_score" in result.columns and shown != result.score:
-                return f"{text} in its last training episodes ({shown:.4f} without exploration)"
-            return text
-        # Runners that do everything themselves may have rows without a score.
-        if self.contact == "hard" or "score" not in result.columns:
-            return text
-        shown = float(result.columns["score"][result.best_iteration])
-        if f"{shown:.4f}" == f"{result.score:.4f}":
-            return text
-        return f"{text} in the hard contact model ({shown:.4f} in the {self.contact} one of its iterations)"
 
     def outcome(self) -> Outcome:
         """Return the end of the run."""
@@ -268,3 +251,89 @@ def report(outcomes: Sequence[Outcome]) -> int:
         if not one.finished:
             tell(f"{one.title}: {one.message}")
     return 2 if count["refused"] else int(any(not one.finished for one in outcomes))
+
+
+# ------------------------------------------------------------------------------------------------------- logs
+
+PROJECT = "plab"
+"""Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
+
+
+class RunLog:
+    """Log of a run beside its file, as ``logger`` says, opened at the first numbers.
+
+    Each row is logged at the environment steps that its actions have cost, under the names of the results'
+    columns, and the final evaluation under ``final/``.
+    """
+
+    def __init__(self, cfg: Config, run: RunFile) -> None:
+        """Keep the run's configuration and file."""
+        self._cfg, self._run = cfg, run
+        self._write: Callable[[Mapping[str, float], int], object] | None = None
+        self._close: Callable[[], object] = lambda: None
+
+    @property
+    def wanted(self) -> bool:
+        """Return whether the run has a logger."""
+        return self._cfg.logger != "none"
+
+    def write(self, values: Mapping[str, float], steps: int) -> None:
+        """Log numbers by name at some environment steps, those that are not finite left out; ResultsError
+        if that fails."""
+        if not self.wanted:
+            return
+        try:
+            if self._write is None:
+                opened = {"tensorboard": self._tensorboard, "wandb": self._wandb}[self._cfg.logger]
+                self._write, self._close = opened(steps)
+            self._write({name: float(value) for name, value in values.items() if math.isfinite(value)}, steps)
+        except (OSError, RuntimeError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ResultsError(f"logger={self._cfg.logger} fails: {reason}; logger=none goes on") from error
+
+    def close(self) -> None:
+        """End the log."""
+        # All rows have been written; the final evaluation is in the result file.
+        with suppress(OSError, RuntimeError):
+            self._close()
+
+    def _tensorboard(self, steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
+        """Open a TensorBoard event file in the folder ``<name>.tensorboard`` beside the result; TensorBoard
+        hides entries of earlier processes after ``steps``."""
+        # Imported here, as below: it is optional.
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        writer = SummaryWriter(str(self._run.path.with_suffix(".tensorboard")), purge_step=steps)
+
+        def write(values: Mapping[str, float], steps: int) -> None:
+            for name, value in values.items():
+                writer.add_scalar(name, value, steps)
+            # To be seen at once.
+            writer.flush()
+
+        return write, writer.close
+
+    def _wandb(self, steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
+        """Begin a run at Weights & Biases, or go on with that of the same configuration; its own files are in
+        the folder ``wandb`` of ``results_dir``, and ``WANDB_MODE`` and wandb's other variables apply."""
+        import wandb
+
+        cfg = self._cfg
+        name = f"{cfg.task.name}-v{cfg.variant}-{cfg.method.name}-{self._run.path.stem}"
+        try:
+            begun = wandb.init(
+                project=os.environ.get("WANDB_PROJECT") or PROJECT,
+                name=name,
+                # Ids are limited to 128 characters.
+                id=re.sub(r"[^\w.-]", "_", name)[:128],
+                dir=cfg.results_dir,
+                config=self._run.result.config,
+                resume="allow",
+                # The runs of a batch are logged side by side.
+                reinit="create_new",
+                settings=wandb.Settings(silent=True, console="off"),
+            )
+        except wandb.Error as error:
+            raise RuntimeError(f"{error} (WANDB_MODE=offline needs no account)") from error
+        begun.define_metric("*", step_metric="steps")
+        return lambda values, steps: begun.log({**values, "steps": steps}), begun.finish

@@ -21,10 +21,10 @@ import numpy as np
 from plab.config import Config, ConfigError
 from plab.config.draws import without_draws
 from plab.config.selection import OBSERVATION_KEYS
+from plab.plugins import torch
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.libraries import torch
-from plab.runners.policy import PolicyConfig, save_policy, torch_settings
+from plab.runners.policy import Moments, PolicyConfig, save_policy, torch_settings
 from plab.runners.runner import (
     FINAL_STATE_COLUMNS,
     Runner,
@@ -208,13 +208,8 @@ class Training(ABC):
         """Read a policy's replay buffer, if it has one; ResultsError if that fails."""
 
     @abstractmethod
-    def policy(self, run: int) -> BasePolicy:
-        """Return a policy as Stable-Baselines3 has it."""
-
-    def moments(self, run: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return means and variances by which a policy's observations are scaled, shape [entry] each, if they
-        are."""
-        return None
+    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
+        """Return a policy as Stable-Baselines3 has it, and by what its observations are scaled, if at all."""
 
 
 def whole_cycles(steps: int, cycle: int) -> int:
@@ -320,21 +315,19 @@ class PolicyRunner(Runner):
             except ResultsError as error:
                 track.fail(error)
                 continue
-            yield (
-                track,
-                Step(
-                    done.measures | own.measures,
-                    done.actions,
-                    state,
-                    episodes=training.episodes,
-                    steps=training.steps,
-                    steps_forward=len(done.actions) + steps - gradient,
-                    steps_gradient=gradient,
-                    seconds=share + time.perf_counter() - start,
-                    keep=training.steps >= training.total_steps,
-                    whole=not done.failure,
-                ),
+            step = Step(
+                done.measures | own.measures,
+                done.actions,
+                state,
+                episodes=training.episodes,
+                steps=training.steps,
+                steps_forward=len(done.actions) + steps - gradient,
+                steps_gradient=gradient,
+                seconds=share + time.perf_counter() - start,
+                keep=training.steps >= training.total_steps,
+                whole=not done.failure,
             )
+            yield track, step
 
     def extent(self) -> tuple[int, int, int]:
         """Return episodes done and in all, and those between two evaluations."""
@@ -351,8 +344,7 @@ class PolicyRunner(Runner):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
-        policy, moments = self.policies.policy(track.number), self.policies.moments(track.number)
-        save_policy(track.run.path, self.method, policy, moments)
+        save_policy(track.run.path, self.method, *self.policies.policy(track.number))
         _replay_path(track).unlink(missing_ok=True)
 
 

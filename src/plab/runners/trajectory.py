@@ -118,24 +118,18 @@ class TrajectoryRunner(Runner):
             kept = finalists.keep_best() if track in checks else None
             if track in checks and self.iterations(track) == track.iteration + 1:
                 track.run.result.provenance["lowest_loss_score"] = finalists.lowest.hard_score
-            yield (
-                track,
-                Step(
-                    row | {"kept_score": finalists.kept_score},
-                    tried[track.number],
-                    {
-                        "actions": rule.actions,
-                        "optimizer": dict(rule.state),
-                        "finalists": finalists.state(),
-                    },
-                    steps_forward=checks.get(track, 0) * len(rule.actions),
-                    steps_gradient=len(rule.actions),
-                    seconds=share,
-                    # Until the first check those of the lowest loss are kept.
-                    whole=np.isnan(finalists.kept_score) or track not in judging,
-                    best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
-                ),
+            step = Step(
+                row | {"kept_score": finalists.kept_score},
+                tried[track.number],
+                {"actions": rule.actions, "optimizer": dict(rule.state), "finalists": finalists.state()},
+                steps_forward=checks.get(track, 0) * len(rule.actions),
+                steps_gradient=len(rule.actions),
+                seconds=share,
+                # Until the first check those of the lowest loss are kept.
+                whole=np.isnan(finalists.kept_score) or track not in judging,
+                best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
             )
+            yield track, step
 
     def _is_due(self, track: Track) -> bool:
         return (track.iteration + 1) % CHECK_INTERVAL == 0 or track.iteration + 1 == self.iterations(track)

@@ -9,20 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.errors import PlabError
-from plab.laws import Law, find_law
+from plab.errors import ConfigError, PlabError, pick
+from plab.laws import Law
+from plab.plugins import Registry, load_object
 
 if TYPE_CHECKING:
     from plab.scenes.mesh import Mesh
 
 __all__ = [
     "BODY_SHAPES",
+    "LAWS",
     "MATERIAL_KEYS",
     "Body",
     "Material",
     "MeshBody",
     "SceneError",
     "Vec3",
+    "find_law",
     "make_body",
     "vector3",
 ]
@@ -33,6 +36,15 @@ BODY_SHAPES = ("sphere", "box", "mesh")
 MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
 """Parameters that bodies share with their scene unless they have their own, as fields of a
 :class:`Material`."""
+
+LAWS: Mapping[str, Law] = Registry(
+    Law,
+    {
+        name: f"plab.laws.{name}:{name.upper()}"
+        for name in ("von_mises", "elastic", "drucker_prager", "fluid", "viscoplastic")
+    },
+)
+"""plab's own laws by name."""
 
 Vec3 = tuple[float, float, float]
 
@@ -47,6 +59,19 @@ def vector3(values: Sequence[float]) -> Vec3:
     return x, y, z
 
 
+def find_law(name: str) -> Law:
+    """Return a law by its name, or by ``module:NAME`` for a law outside plab.
+
+    Raises:
+        plab.config.ConfigError: If there is none; one line.
+    """
+    if name in LAWS:
+        return LAWS[name]
+    if ":" not in name:
+        raise ConfigError(f"law '{name}' does not exist; {pick(name, list(LAWS))}; or module:NAME")
+    return load_object(name, Law)
+
+
 class SceneError(PlabError, ValueError):
     """A scene that cannot be simulated; the message says why and which value would do."""
 
@@ -59,7 +84,7 @@ class Material:
         youngs_modulus: Young's modulus E.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
-        law: Name of the law, see :func:`plab.laws.find_law`.
+        law: Name of the law, see :func:`find_law`.
         parameters: Other parameters of the law, by name; defaults where none is given.
     """
 
@@ -120,7 +145,7 @@ class Body:
         youngs_modulus: Young's modulus E; the scene's if None.
         poisson_ratio: Poisson ratio nu; the scene's if None.
         yield_stress: von Mises yield stress; the scene's if None.
-        law: Name of its law, see :func:`plab.laws.find_law`; ``von_mises`` if None.
+        law: Name of its law, see :func:`find_law`; ``von_mises`` if None.
         parameters: Other parameters of the law, by name.
     """
 

@@ -15,12 +15,14 @@ import numpy as np
 
 from plab.scenes.bodies import (
     BODY_SHAPES,
+    LAWS,
     MATERIAL_KEYS,
     Body,
     Material,
     MeshBody,
     SceneError,
     Vec3,
+    find_law,
     make_body,
     vector3,
 )
@@ -32,6 +34,7 @@ __all__ = [
     "CONTACTS",
     "CONVENTIONS",
     "DEVICES",
+    "LAWS",
     "MANIPULATOR_SHAPES",
     "MATERIAL_KEYS",
     "PRECISIONS",
@@ -44,6 +47,8 @@ __all__ = [
     "Scene",
     "SceneError",
     "Vec3",
+    "find_law",
+    "link_manipulators",
     "make_body",
     "sample_particles",
     "vector3",
@@ -452,6 +457,19 @@ class Scene:
 def _require(condition: bool, message: str) -> None:
     if not condition:
         raise SceneError(message)
+
+
+def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
+    """Return the links of an articulated model as manipulators, where they are at t = 0."""
+    from scipy.spatial.transform import Rotation
+
+    frames = chain.frames([joint.start for joint in chain.joints])
+    turns = Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
+    wide: dict[str, Any] = {"lower_bound": (-1.0,) * 3, "upper_bound": (2.0,) * 3}
+    return tuple(
+        Manipulator(k.shape, k.size, vector3(at.tolist()), tuple(q.tolist()), friction=friction, **wide)
+        for k, at, q in zip(chain.links, frames[:, :3, 3], turns, strict=True)
+    )
 
 
 def sample_particles(scene: Scene) -> np.ndarray:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.laws import find_law
-from plab.scenes import MATERIAL_KEYS, Material, Scene, SceneError
+from plab.scenes import MATERIAL_KEYS, Material, Scene, SceneError, find_law
 
 SHARED = (
     "particle_count",

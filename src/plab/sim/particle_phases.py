@@ -8,7 +8,7 @@ one per axis, also 4-vectors: three components of momentum or velocity and the m
 from collections.abc import Callable
 from typing import Any
 
-from plab.laws import LAWS
+from plab.scenes import LAWS
 from plab.sim.codegen.bitcode import bitcode_file, symbol
 from plab.sim.compiler import bitcode_function, ti
 from plab.sim.spectral import (

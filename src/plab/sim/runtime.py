@@ -79,9 +79,12 @@ _thread: int | None = None
 
 def available_threads() -> int:
     """Number of CPUs available to this process, limited by ``OMP_NUM_THREADS``."""
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wish = os.environ.get("OMP_NUM_THREADS", "")
-    return min(cpus, int(wish)) if wish.isdigit() and int(wish) > 0 else cpus
+    return min(_cpus(), int(wish)) if wish.isdigit() and int(wish) > 0 else _cpus()
+
+
+def _cpus() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def start_runtime(device: str, precision: str, threads: int | None = None) -> Runtime:
@@ -93,7 +96,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     Args:
         device: ``cpu`` or ``cuda``.
         precision: ``float32`` or ``float64``.
-        threads: CPU threads; default: all available.
+        threads: CPU threads, at most as many as there are CPUs; default: all available.
 
     Returns:
         The runtime in force.
@@ -113,7 +116,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
         raise ArgumentError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
-    wanted = 1 if device == "cuda" else max(1, threads or available_threads())
+    # Threads that wait at barriers for others without a CPU can wait for good.
+    wanted = 1 if device == "cuda" else max(1, min(threads or available_threads(), _cpus()))
     # Taichi's cache identifies kernels by the numbers of fields, so the count restarts when no simulator is
     # left.
     if _current is not None and len(_users) > 0:
@@ -185,6 +189,13 @@ def cuda_driver() -> ctypes.CDLL | None:
     except OSError:
         return None
     return driver if driver.cuInit(0) == 0 else None
+
+
+def cuda_devices() -> int:
+    """Return the number of CUDA devices."""
+    count, driver = ctypes.c_int(0), cuda_driver()
+    known = driver is not None and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    return count.value if known else 0
 
 
 def in_use() -> Runtime | None:

@@ -4,6 +4,6 @@
 ``plab leaderboard`` makes a page of many. docs/submissions.md shows the way.
 """
 
-from plab.submissions.collecting import record
+from plab.submissions.recorder import record
 
 __all__ = ["record"]

@@ -1,144 +1,27 @@
-"""Entries of submissions: episodes of an agent, plab's own results, policies.
-
-from plab.submissions import record
-
-env = record(gymnasium.make("plab/Move-v1"), "recordings")
-"""
+"""Entries of submissions from recordings, plab's own results and policies."""
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
 
-import numpy as np
-
-from plab.config import Config, load_config
+from plab.config import load_config
 from plab.config.selection import Selection
-from plab.envs.core import EpisodeBatch, Transition
 from plab.render import RenderError, rollouts
-from plab.report.statistics import BUDGETS, load_rows
-from plab.results import ResultsError, Row
+from plab.report.series import load_rows
+from plab.results import Row
 from plab.results.table import readable_rows
 from plab.submissions.submission import (
     SUFFIX,
     Checksums,
     Configuration,
     Entry,
-    Submission,
     SubmissionError,
     configuration_of,
-    encode,
     read,
     variant_words,
-    write,
 )
 from plab.submissions.verifying import load_policy, play
-
-# ------------------------------------------------------------------------------------------------ recordings
-
-_ledgers: dict[Path, _BestEpisodes] = {}
-"""Ledgers of this process by file: environments of one configuration share one, and their steps add up."""
-
-Env = TypeVar("Env")
-
-
-class _BestEpisodes:
-    """Best episodes of one configuration, one within each budget, in a file.
-
-    Attributes:
-        steps: Environment steps simulated so far.
-    """
-
-    def __init__(self, cfg: Config, path: Path) -> None:
-        """Create the file.
-
-        Raises:
-            SubmissionError: If there is a file already.
-            ResultsError: If it cannot be written.
-        """
-        self.steps = 0
-        self._configuration, self._digests = configuration_of(cfg), Checksums.of(cfg)
-        self._best: dict[float, Entry] = {}
-        self._path = path
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # Without entries: two processes cannot both create it.
-            with path.open("xb") as file:
-                file.write(encode(Submission(None, ())))
-        except FileExistsError:
-            why = "is there already: record into another folder, or remove it"
-            raise SubmissionError(f"{path} {why}") from None
-        except OSError as error:
-            raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
-
-    def add(self, actions: np.ndarray, score: float) -> None:
-        """Take an episode into account: its actions, shape [T, A], and the score that they reached."""
-        better = [
-            limit
-            for limit in (*BUDGETS, math.inf)
-            if self.steps <= limit and (limit not in self._best or score > self._best[limit].score)
-        ]
-        if not better:
-            return
-        entry = Entry(self._configuration, self._digests, self.steps, score, np.clip(actions, -1.0, 1.0))
-        self._best |= dict.fromkeys(better, entry)
-        kept = {best.steps: best for best in self._best.values()}
-        write(Submission(None, tuple(kept[steps] for steps in sorted(kept))), self._path)
-
-
-def record(env: Env, folder: str | Path) -> Env:
-    """Record the episodes of an agent, for ``plab submit``.
-
-    Of each configuration a file in ``folder`` holds the actions of the best episode within each budget of
-    :data:`plab.report.statistics.BUDGETS` and of the best one of all, with the environment steps simulated
-    until then. All environments of one configuration in a process share it. It is written whenever an
-    episode is better; episodes that are left before their end count by their steps.
-
-    Args:
-        env: A single or vector environment of plab in the hard contact model, with any wrappers.
-        folder: Folder of the recordings, of this training only.
-
-    Returns:
-        The same environment.
-
-    Raises:
-        SubmissionError: If that cannot be recorded, or the folder has a recording of another process.
-        plab.results.ResultsError: If the file cannot be written.
-    """
-    inner = getattr(env, "unwrapped", None)
-    batch = getattr(inner, "batch", None)
-    if not isinstance(batch, EpisodeBatch):
-        raise SubmissionError(f"{type(inner).__name__} is no environment of plab's")
-    if batch.contact != "hard":
-        raise SubmissionError("the contact model is soft: scores are of the hard one")
-    ledgers = []
-    for cfg in batch.configs:
-        path = Path(folder).resolve() / f"{configuration_of(cfg).name}{SUFFIX}"
-        if path not in _ledgers or not path.exists():
-            _ledgers[path] = _BestEpisodes(cfg, path)
-        ledgers.append(_ledgers[path])
-    taken: deque[np.ndarray] = deque(maxlen=batch.horizon)
-
-    def observe(actions: Any, result: Transition) -> None:
-        taken.append(np.array(actions, np.float64))
-        for ledger in ledgers:
-            ledger.steps += 1
-        if "randomized" in result.info or not result.truncated.any():
-            return
-        # Of an episode that has reached the horizon the last steps are all.
-        episodes = np.stack(taken, axis=1)
-        for e in np.flatnonzero(result.truncated):
-            if e not in result.failures:
-                ledgers[e].add(episodes[e], float(result.info["score"][e]))
-
-    batch.listener = observe
-    return env
-
-
-# --------------------------------------------------------------------------------------- results and policies
 
 
 def submission_files(source: Path) -> list[Path]:

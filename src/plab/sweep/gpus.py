@@ -1,32 +1,53 @@
-"""Pool of processes on all GPUs of this computer, each given a batch whenever it is free."""
+"""Batches of a sweep in processes on all GPUs of this computer."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing.connection import Connection, wait
 from typing import Any, TypeAlias
 
 from plab import runners
 from plab.config import Config, ConfigError
-from plab.config.compose import cuda_devices
-from plab.progress import forward_to, show_several
 from plab.runners.runner import SimulatorCache
 from plab.runners.tracks import Outcome
+from plab.sim.runtime import cuda_devices
 
 Kind: TypeAlias = tuple[str, str]
 """Task and family of methods: batches of one kind may share a simulator."""
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
-PATIENCE = 30.0
-"""Time for processes to close their files after Ctrl-C [s]."""
+
+class _Worker:
+    """A process on a GPU, started anew if the last one was killed.
+
+    Attributes:
+        kind: Kind of its last batch, whose simulator it still has.
+    """
+
+    def __init__(self, gpu: str) -> None:
+        self._gpu, self._pool = gpu, _pool(gpu)
+        self.kind: Kind | None = None
+
+    def submit(self, batch: list[Config], note: str) -> Future[list[Outcome]]:
+        """Let it carry out a batch."""
+        self.kind = _kind(batch)
+        return self._pool.submit(_carry_out, batch, f"GPU {self._gpu} {note}")
+
+    def restart(self) -> None:
+        """Replace a process that was killed."""
+        self._pool, self.kind = _pool(self._gpu), None
+
+    def end(self) -> None:
+        """Wait until its files are closed and its kernels cached."""
+        self._pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
@@ -51,43 +72,44 @@ def gpu_workers(
     if not (names := [str(one).strip() for one in found]):
         raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
     # One process for each GPU before any has its second.
-    places = [(name, k) for k in range(per_gpu) for name in names]
-    workers = [
-        _Worker(name, f"GPU {name}" if per_gpu == 1 else f"GPU {name}, {k + 1}", look_up)
-        for name, k in places[:most]
-    ]
+    places = names * per_gpu
+    workers = [_Worker(name) for name in places[:most]]
     try:
-        yield partial(_dispatch, workers), len(places)
+        yield partial(_dispatch, workers, look_up), len(places)
+    except BaseException:
+        # After Ctrl-C: those that are at work write a checkpoint.
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
-        for worker in workers:
-            worker.dismiss()
         for worker in workers:
             worker.end()
 
 
 def _dispatch(
-    workers: Sequence[_Worker], batches: list[list[Config]], progress: Callable[[], str]
+    workers: Sequence[_Worker],
+    look_up: Callable[[Config], Outcome],
+    batches: list[list[Config]],
+    progress: Callable[[], str],
 ) -> Iterator[Outcome]:
-    """Give batches to free processes, print which runs have finished, and yield the outcomes."""
-    waiting = list(batches)
-    used = workers[: len(batches)]
-    shown = any(cfg.progress for batch in batches for cfg in batch)
-    with show_several([worker.label for worker in used], enabled=shown) as report:
-        while waiting or any(worker.batch for worker in used):
-            for worker in used:
-                if waiting and not worker.batch:
-                    others = [other.kind for other in used if other is not worker]
-                    worker.give(waiting.pop(choose(waiting, worker.kind, others)), progress())
-            heard = wait([worker.connection for worker in used if worker.batch])
-            for worker in (worker for worker in used if worker.connection in heard):
-                for kind, *content in worker.messages():
-                    if kind != "ended":
-                        report(worker.label, kind, *content)
-                        continue
-                    for one in content[0]:
-                        if one.status == "finished":
-                            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
-                        yield one
+    """Give batches to free processes, and yield the outcomes."""
+    waiting, free = list(batches), list(workers)
+    running: dict[Future[list[Outcome]], tuple[_Worker, list[Config]]] = {}
+    while waiting or running:
+        while waiting and free:
+            worker = free.pop(0)
+            others = [one.kind for one in workers if one is not worker]
+            batch = waiting.pop(choose(waiting, worker.kind, others))
+            running[worker.submit(batch, progress())] = worker, batch
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            worker, batch = running.pop(future)
+            free.append(worker)
+            try:
+                yield from future.result()
+            except BrokenProcessPool:
+                # Killed: the files know how far it came.
+                worker.restart()
+                yield from map(look_up, batch)
 
 
 def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
@@ -107,85 +129,28 @@ def _kind(batch: Sequence[Config]) -> Kind:
     return batch[0].task.name, batch[0].method.family
 
 
-class _Worker:
-    """A process that carries out batches on a GPU; if it is killed, another takes its place.
+# --------------------------------------------------------------------------------------- inside the processes
 
-    Attributes:
-        name: The GPU.
-        label: Name before its progress.
-        batch: Batch that it carries out; empty if none.
-        kind: Kind of that batch, or of the last one.
-    """
-
-    def __init__(self, name: str, label: str, look_up: Callable[[Config], Outcome]) -> None:
-        self.name, self.label, self._look_up = name, label, look_up
-        self.batch: list[Config] = []
-        self.kind: Kind | None = None
-        self._start()
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(self.name, theirs), daemon=True)
-        # Ctrl-C reaches all processes of a terminal: this one sees to it that the other ends.
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self.process.start()
-        signal.signal(signal.SIGINT, handler)
-        theirs.close()
-
-    def give(self, batch: list[Config], note: str) -> None:
-        """Send a batch to the process."""
-        if not self.process.is_alive():
-            self._start()
-        self.batch, self.kind = batch, _kind(batch)
-        self.connection.send((batch, note))
-
-    def messages(self) -> Iterator[tuple[Any, ...]]:
-        """Yield its messages: progress, or the outcomes of its batch."""
-        try:
-            while self.connection.poll():
-                message = self.connection.recv()
-                if message[0] == "ended":
-                    self.batch = []
-                yield message
-        except (EOFError, OSError):
-            # Killed: the files know how far it came.
-            self.process.join()
-            outcomes = [self._look_up(cfg) for cfg in self.batch]
-            self.batch = []
-            yield "ended", outcomes
-
-    def dismiss(self) -> None:
-        """End the process, interrupting a batch in progress."""
-        self.connection.close()
-        if self.batch:
-            self.process.terminate()
-
-    def end(self) -> None:
-        """Wait until its files are closed and its kernels cached."""
-        # One that was never given anything may be loading still.
-        self.process.join(PATIENCE if self.kind else 0.0)
-        self.process.kill()
+_cache = SimulatorCache()
 
 
-def _work(name: str, connection: Connection) -> None:
-    """Execute batches until none are left; runs in a separate process."""
-    os.environ[VISIBLE] = name
-    # On platforms where an ignored Ctrl-C is not inherited.
+def _pool(gpu: str) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (gpu,))
+
+
+def _begin(gpu: str) -> None:
+    os.environ[VISIBLE] = gpu
+    # Ctrl-C reaches all processes of a terminal: the one that has started this one sees to its end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # The process that has started this one shows the progress.
-    sys.stdout = open(os.devnull, "w")
-    forward_to(lambda *content: connection.send(content))
-    cache = SimulatorCache()
+
+
+def _carry_out(batch: list[Config], note: str) -> list[Outcome]:
+    handler: Any = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        while True:
-            batch, note = connection.recv()
-            connection.send(("ended", runners.run_batch(batch, note, cache)))
-    except (EOFError, OSError, KeyboardInterrupt):
-        # The parent has ended, or no batches are left.
-        return
+        return runners.run_batch(batch, note, _cache)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _end_with_parent() -> None:

@@ -12,28 +12,25 @@ import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.plugins import Registry
 from plab.scenes import Scene, SceneError
-from plab.targets import recipes, scripted
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore
 
 if TYPE_CHECKING:
     from plab.sim import Simulator
 
-RECIPES: dict[str, type[Recipe]] = {
-    "bodies": recipes.BodiesTarget,
-    "ring": recipes.RingTarget,
-    "points": recipes.PointsTarget,
-    "mass": recipes.MassTarget,
-    "carry": scripted.CarryTarget,
-    "dent": scripted.DentTarget,
-    "draw": scripted.DrawTarget,
-    "gesture": scripted.GestureTarget,
-    "lift": scripted.LiftTarget,
-    "press": scripted.PressTarget,
-    "push": scripted.PushTarget,
-    "roll": scripted.RollTarget,
-}
+RECIPES: Mapping[str, type[Recipe]] = Registry(
+    type,
+    {
+        name: f"plab.targets.{module}:{name.capitalize()}Target"
+        for module, names in (
+            ("recipes", ("bodies", "ring", "points", "mass")),
+            ("scripted", ("carry", "dent", "draw", "gesture", "lift", "press", "push", "roll")),
+        )
+        for name in names
+    },
+)
 """Recipes by the name that ``target.recipe`` gives."""
 
 
@@ -76,8 +73,8 @@ def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
     """
-    recipe = make_recipe(target)
-    return recipe.actions(scene) if isinstance(recipe, scripted.Script) else None
+    recipe: Any = make_recipe(target)
+    return None if isinstance(recipe, TensorRecipe) else recipe.actions(scene)
 
 
 def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
@@ -154,7 +151,7 @@ def build_targets(
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
     """Return the scene that a target is made from: draw 0 of the particles, in the recipe's material."""
-    material: dict[str, Any] = recipe.material if isinstance(recipe, scripted.Script) else {}
+    material: dict[str, Any] = getattr(recipe, "material", {})
     made_from = replace(scene, particle_seed=0, **material)
     if material:
         try:

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.kinematics.chain import matched
-from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene, SceneError
+from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 DRAWS = 200
@@ -383,6 +382,9 @@ class GestureTarget(Script):
 
     def actions(self, scene: Scene) -> np.ndarray:
         """See :meth:`Script.actions`."""
+        # Imported here: few tasks have an articulated model.
+        from plab.kinematics.chain import ModelError, matched
+
         chain = scene.kinematics
         if self.seed < 0 or chain is None:
             reason = "the recipe needs a task with kinematics" if chain is None else "seed must be at least 0"
@@ -397,7 +399,7 @@ class GestureTarget(Script):
                 value = _draw(rng, f"postures[{number}].joints.{pattern}", limits)
                 try:
                     goal |= matched(f"target.postures[{number}]", {pattern: value}, list(joints))
-                except SceneError as error:
+                except ModelError as error:
                     raise TargetError(str(error)) from None
             shares = {name: (to - at[name]) / joints[name].scale for name, to in goal.items()}
             most = max(map(abs, shares.values()), default=0.0)

@@ -4,9 +4,17 @@
 """
 
 from plab.config.families import Appearance, Family, Rule
-from plab.runners.planners.multistart import Multistart, MultistartConfig
 from plab.runners.planners.planner import PlannerConfig, PlannerRunner, Stages, StagesConfig
-from plab.runners.planners.samplers import Cem, CemConfig, Cmaes, CmaesConfig, Mppi, MppiConfig
+from plab.runners.planners.searches import (
+    Cem,
+    CemConfig,
+    Cmaes,
+    CmaesConfig,
+    Mppi,
+    MppiConfig,
+    Multistart,
+    MultistartConfig,
+)
 
 FAMILY = Family(
     label="a sequence of actions, searched for with many candidates",

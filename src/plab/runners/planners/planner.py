@@ -19,7 +19,7 @@ import numpy as np
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import family
-from plab.runners.libraries import torch
+from plab.plugins import torch
 from plab.runners.policy import torch_settings
 from plab.runners.runner import Runner, Step, Track, shared_problem
 
@@ -98,15 +98,9 @@ class Answer:
         return torch.where(self.broken, torch.inf, cost)
 
 
-@dataclass(frozen=True)
-class Preview:
-    """Best candidate of an iteration: actions in [-1, 1], shape [T, A], and its measures."""
-
-    actions: Tensor
-    measures: dict[str, float]
-
-
-Asking: TypeAlias = Generator[Request, Answer, Preview]
+Asking: TypeAlias = "Generator[Request, Answer, tuple[Tensor, dict[str, float]]]"
+"""Iteration of a planner: requests that are answered, and at last the best candidate's actions in [-1, 1],
+shape [T, A], and its measures."""
 
 
 class CandidateStart:
@@ -180,13 +174,14 @@ class Planner(ABC):
         self.iteration += 1
         return shown
 
-    def show(self, actions: Tensor, answer: Answer) -> Preview:
-        """Return the best of some candidates, given their evaluation in the hard contact model."""
+    def show(self, actions: Tensor, answer: Answer) -> tuple[Tensor, dict[str, float]]:
+        """Return the best of some candidates and its measures, given their evaluation in the hard contact
+        model."""
         cost = answer.cost("score")
         best = int(cost.argmin())
         if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
             self.memory |= {"champion": actions[best].clone(), "cost": cost[best].clone()}
-        return Preview(actions[best], {name: float(values[best]) for name, values in answer.measures.items()})
+        return actions[best], {name: float(values[best]) for name, values in answer.measures.items()}
 
     def state(self) -> dict[str, Any]:
         """Return everything that the next iterations depend on, as arrays and numbers."""
@@ -306,7 +301,7 @@ class PlannerRunner(Runner):
         spent = {track: {False: 0, True: 0} for track in tracks}
         asking = {track: self._planners[track.number].plan(self._random(track)) for track in tracks}
         pending = {track: next(walk) for track, walk in asking.items()}
-        shown: dict[Track, Preview] = {}
+        shown: dict[Track, tuple[Tensor, dict[str, float]]] = {}
         while pending:
             first = next(iter(pending.values()))
             kind = first.gradient, first.actions.shape
@@ -320,18 +315,16 @@ class PlannerRunner(Runner):
                 except StopIteration as stop:
                     shown[track] = stop.value
         share = (time.perf_counter() - begin) / len(tracks)
-        for track, best in shown.items():
-            yield (
-                track,
-                Step(
-                    best.measures,
-                    best.actions.cpu().numpy().copy(),
-                    self._planners[track.number].state(),
-                    steps_forward=spent[track][False],
-                    steps_gradient=spent[track][True],
-                    seconds=share,
-                ),
+        for track, (actions, measured) in shown.items():
+            step = Step(
+                measured,
+                actions.cpu().numpy().copy(),
+                self._planners[track.number].state(),
+                steps_forward=spent[track][False],
+                steps_gradient=spent[track][True],
+                seconds=share,
             )
+            yield track, step
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Run the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
@@ -345,17 +338,19 @@ class PlannerRunner(Runner):
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
         """Evaluate candidates of some runs, the same number per run; runs whose candidates all diverge
         fail."""
-        first = next(iter(requests.values()))
+        first, width = next(iter(requests.values())), self._width
+        count, reasons = len(first.actions), dict[int, str]()
+        # By candidate and run; as many candidates as there are environments for are tried at once.
+        size = count + -count % width, len(self.tracks), *first.actions.shape[1:]
+        tried = torch.zeros(size, dtype=torch.float64, device=self._device)
         softness = np.zeros(len(self.tracks))
         for track, request in requests.items():
+            tried[:count, track.number] = request.actions
             softness[track.number] = request.softness or 0.0
         models = np.where(softness > 0, "soft", "hard")
-        self.problem.simulator.set_contact(
-            list(models) * self._width, np.tile(softness, self._width).tolist()
-        )
-        count, reasons = len(first.actions), dict[int, str]()
-        parts = [self._try_part(requests, k, first, reasons) for k in range(0, count, self._width)]
-        whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        self.problem.simulator.set_contact(list(models) * width, np.tile(softness, width).tolist())
+        parts = [self._totals(part, first.gradient, reasons) for part in tried.split(width)]
+        whole = {name: torch.cat([part[name] for part in parts])[:count] for name in parts[0]}
         answers = {}
         for track in requests:
             own = {name: values[:, track.number] for name, values in whole.items()}
@@ -367,29 +362,20 @@ class PlannerRunner(Runner):
                 track.fail(f"none of {count} candidates came through; {reasons[track.number]}")
         return answers
 
-    def _try_part(
-        self, requests: Mapping[Track, Request], begin: int, first: Request, reasons: dict[int, str]
-    ) -> dict[str, Tensor]:
-        """Try as many candidates of each run as there are environments for, from candidate ``begin`` on.
-
-        Returns:
-            Results by name, shape [candidate, run, ...]; ``reasons`` gets a reason per run with failures.
-        """
-        width, runs = self._width, len(self.tracks)
-        tried = torch.zeros((width, runs, *first.actions.shape[1:]), dtype=torch.float64, device=self._device)
-        for track, request in requests.items():
-            mine = request.actions[begin : begin + width]
-            tried[: len(mine), track.number] = mine
-        trials = self.problem.try_out(tried.flatten(0, 1), gradient=first.gradient)
-        broken = torch.zeros(width * runs, dtype=torch.bool, device=self._device)
+    def _totals(self, tried: Tensor, gradient: bool, reasons: dict[int, str]) -> dict[str, Tensor]:
+        """Return results of candidates by name, shape [candidate, run, ...] all; ``reasons`` gets one per
+        run with failures."""
+        trials, runs = self.problem.try_out(tried.flatten(0, 1), gradient=gradient), len(self.tracks)
+        broken = torch.zeros(len(tried) * runs, dtype=torch.bool, device=self._device)
         broken[list(trials.failures)] = True
         reasons |= {e % runs: text for e, text in trials.failures.items()}
         given = trials.measures | {"final": trials.final_loss, "broken": broken}
-        if first.gradient:
+        if gradient:
             given["gradient"] = trials.gradient
-        tensors = {name: torch.as_tensor(values) for name, values in given.items()}
-        size = min(width, len(first.actions) - begin)
-        return {name: v.reshape(width, runs, *v.shape[1:])[:size] for name, v in tensors.items()}
+        return {
+            name: torch.as_tensor(values).reshape(len(tried), runs, *values.shape[1:])
+            for name, values in given.items()
+        }
 
 
 def _smallest_population(method: Any) -> int:

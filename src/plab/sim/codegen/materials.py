@@ -16,8 +16,9 @@ from typing import Any
 
 from llvmlite import ir
 
-from plab.laws import LAWS, Law, algebra, von_mises
+from plab.laws import Law, algebra, von_mises
 from plab.laws.tracing import Primitive, Trace, derivatives, evaluated
+from plab.scenes import LAWS
 from plab.sim.codegen.llvm import LANE, Code, Number, Scalars
 from plab.sim.storage import (
     AT_C,
