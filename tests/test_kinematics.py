@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
+from scipy.spatial.transform import Rotation
 
 import plab
 from plab.cli.main import main
@@ -115,6 +117,35 @@ def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
     scene = small(*link_manipulators(chain, 1.0), kinematics=chain)
     found = JointActions([scene]).frames(torch.tensor(joints)[None, None])[0, 0]
     np.testing.assert_allclose(mount @ found.numpy(), frames, atol=1e-12)
+
+
+URDF = """<robot name="arm">
+<link name="base"><collision><geometry><cylinder radius="0.03" length="0.1"/></geometry></collision></link>
+<link name="tip">{meshes}</link>
+<joint name="swing" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="0 0 0.1"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+AT = '<origin xyz="0.1 0 0" rpy="0.3 0 0.5"/>'
+MESH = f'<collision>{AT}<geometry><mesh filename="{{}}"/></geometry></collision>'
+
+
+def test_a_urdf_arm_has_boxes_and_capsules_around_its_meshes(tmp_path: Path) -> None:
+    """A plate becomes a box, a bar a capsule of its length, where the joint turns them."""
+    halves = {"plate.obj": (0.1, 0.01, 0.05), "bar.obj": (0.1, 0.01, 0.012)}
+    for name, half in halves.items():
+        trimesh.creation.box(2 * np.array(half)).export(tmp_path / name)
+    (tmp_path / "arm.urdf").write_text(URDF.format(meshes="".join(map(MESH.format, halves))))
+    tree, _digest = read_model(str(tmp_path / "arm.urdf"), size=2.0)
+    (joint,) = tree.joints
+    assert (joint.name, joint.low, joint.high, joint.axis) == ("swing", -1.0, 1.0, (0.0, 1.0, 0.0))
+    assert [link.shape for link in tree.links] == ["BoxLink", "CapsuleLink", "CylinderLink"]
+    swing, turn = (Rotation.from_euler("xyz", angles) for angles in ([0, 0.7, 0], [0.3, 0, 0.5]))
+    signs, (length, radius) = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1, tree.links[1].size
+    expected = tree.links[0].size, (0.02, 0.5 * length + radius, 0.024)
+    for half, frame, reach in zip(halves.values(), tree.frames([0.7]), expected, strict=False):
+        corners = np.add(swing.apply(np.add(2 * turn.apply(signs * half), (0.2, 0, 0))), (0, 0, 0.2))
+        extents = np.abs((corners - frame[:3, 3]) @ frame[:3, :3]).max(axis=0)
+        np.testing.assert_allclose(sorted(extents), sorted(reach), atol=1e-6)
+        assert extents.argmax() == np.argmax(reach)
 
 
 @pytest.fixture(scope="module")

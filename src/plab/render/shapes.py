@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ class Part:
     Attributes:
         vertices: Vertices in the manipulator's frame [domain units], shape [vertex, 3].
         faces: Indices of the four corners of each face, outwards counter-clockwise, shape [face, 4].
-        side: Offset along the own x axis, in gaps: +-1/2 for the chopsticks, 0 otherwise.
+        side: Offset along the own x axis, in gaps: +-1/2 for shapes that grip, 0 otherwise.
     """
 
     vertices: np.ndarray
@@ -44,19 +44,17 @@ class Part:
 
 def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     """Return the parts of a manipulator."""
-    size = manipulator.size
     if manipulator.outline == "Box":
-        return [_box(np.array(size))]
-    if manipulator.outline == "Chopsticks":
-        stick = _revolve(_capsule(-size[0], 0.0, size[1]))
-        return [Part(*stick, side=-0.5), Part(*stick, side=0.5)]
+        return [_box(np.array(manipulator.size))]
     profiles: dict[str, Callable[..., np.ndarray]] = {
+        "Chopsticks": lambda h, r: _capsule(-h, 0.0, r),
         "Sphere": lambda radius: _capsule(0.0, 0.0, radius),
         "Capsule": lambda h, r: _capsule(-h / 2, h / 2, r),
         "Torus": _circle,
         "Cylinder": lambda radius, half: np.array([[0, -half], [radius, -half], [radius, half], [0, half]]),
     }
-    return [Part(*_revolve(profiles[manipulator.outline](*size)))]
+    whole = Part(*_revolve(profiles[manipulator.outline](*manipulator.size)))
+    return [replace(whole, side=side) for side in (-0.5, 0.5)] if manipulator.kind.grips else [whole]
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:

@@ -8,6 +8,7 @@ from it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -83,12 +84,15 @@ class ManipulatorShape:
             ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
         outline: Shape with the same surface; default: its own name.
+        support: Distance from its position to its farthest point in a direction, as a function of its sizes
+            and a unit vector [3] in its own frame; None for shapes that carry between their parts.
     """
 
     size_names: tuple[str, ...]
     motion: str
     action_names: tuple[str, ...]
     outline: str = ""
+    support: Callable[[Sequence[float], np.ndarray], float] | None = None
 
     @property
     def moves(self) -> bool:
@@ -114,14 +118,35 @@ class ManipulatorShape:
 _XYZ = ("x", "y", "z")
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 
+
+def _capsule_support(size: Sequence[float], d: np.ndarray) -> float:
+    return 0.5 * size[0] * abs(d[1]) + size[1]
+
+
+def _torus_support(size: Sequence[float], d: np.ndarray) -> float:
+    return size[0] * np.hypot(d[0], d[2]) + size[1]
+
+
+def _cylinder_support(size: Sequence[float], d: np.ndarray) -> float:
+    return size[0] * np.hypot(d[0], d[2]) + size[1] * abs(d[1])
+
+
+def _box_support(size: Sequence[float], d: np.ndarray) -> float:
+    return float(np.abs(d) @ np.asarray(size))
+
+
 MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
-    "Sphere": ManipulatorShape(("radius",), "translate", _XYZ),
-    "Capsule": ManipulatorShape(("h", "r"), "translate", _XYZ),
-    "RollingPin": ManipulatorShape(("h", "r"), "roll", ("roll", "yaw", "vertical"), "Capsule"),
+    "Sphere": ManipulatorShape(("radius",), "translate", _XYZ, support=lambda size, _d: size[0]),
+    "Capsule": ManipulatorShape(("h", "r"), "translate", _XYZ, support=_capsule_support),
+    "RollingPin": ManipulatorShape(
+        ("h", "r"), "roll", ("roll", "yaw", "vertical"), "Capsule", _capsule_support
+    ),
     "Chopsticks": ManipulatorShape(("h", "r"), "grip", (*_XYZ, *_ROTATION, "close")),
-    "Torus": ManipulatorShape(("tx", "ty"), "translate", _XYZ),
-    "Cylinder": ManipulatorShape(("radius", "half_height"), "static", ()),
-    "Box": ManipulatorShape(("half_x", "half_y", "half_z"), "rigid", (*_XYZ, *_ROTATION)),
+    "Torus": ManipulatorShape(("tx", "ty"), "translate", _XYZ, support=_torus_support),
+    "Cylinder": ManipulatorShape(("radius", "half_height"), "static", (), support=_cylinder_support),
+    "Box": ManipulatorShape(
+        ("half_x", "half_y", "half_z"), "rigid", (*_XYZ, *_ROTATION), support=_box_support
+    ),
 }
 """The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
 (two parallel capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y),
@@ -129,7 +154,9 @@ Box; and links of articulated models, ``<outline>Link``, which follow a twist pe
 displacement [domain units] and the rotation vector of their turn about the world's axes [rad]."""
 
 MANIPULATOR_SHAPES |= {
-    f"{name}Link": ManipulatorShape(MANIPULATOR_SHAPES[name].size_names, "twist", (*_XYZ, *_ROTATION), name)
+    f"{name}Link": replace(
+        MANIPULATOR_SHAPES[name], motion="twist", action_names=(*_XYZ, *_ROTATION), outline=name
+    )
     for name in ("Capsule", "Box", "Sphere", "Cylinder")
 }
 

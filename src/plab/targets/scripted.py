@@ -446,10 +446,9 @@ def _top(body: Body) -> float:
 
 def _below(tool: Manipulator) -> float:
     """Distance that an upright manipulator reaches below its position [domain units]."""
-    reach = {"Sphere": (1.0,), "Capsule": (0.5, 1.0), "Torus": (0.0, 1.0)}.get(tool.outline)
-    if reach is None:
-        raise TargetError(f"the recipe needs a Sphere, Capsule or Torus, not a {tool.shape}")
-    return float(np.dot(reach, tool.size))
+    if tool.kind.support is None:
+        raise TargetError(f"the recipe needs a manipulator that presses with its lower end, not {tool.shape}")
+    return float(tool.kind.support(tool.size, np.array([0.0, -1.0, 0.0])))
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:

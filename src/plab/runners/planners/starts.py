@@ -9,7 +9,7 @@ paths lead over them. Bodies that no manipulator is near to are taken to stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -41,23 +41,15 @@ UNREACHED_COST = 100.0
 OVERSHOOT = (0.5, 1.5)
 """Range of how far they push, in ways of the point that they push."""
 
-_SUPPORT: dict[str, Callable[[Sequence[float], np.ndarray], float]] = {
-    "Sphere": lambda size, d: size[0],
-    "Capsule": lambda size, d: 0.5 * size[0] * abs(d[1]) + size[1],
-    "Torus": lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1],
-    "Box": lambda size, d: float(np.abs(d) @ np.asarray(size)),
-}
-"""Reach of an outline from its position, by its sizes and a direction in its own frame."""
-
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
     """Return how far a manipulator, as it stands at the start, reaches from its position in a direction.
 
     Args:
-        tool: The manipulator; for chopsticks, which carry between the sticks, the result is 0.
+        tool: The manipulator; for one that carries between its parts, such as chopsticks, the result is 0.
         direction: Unit vector [3].
     """
-    reach = _SUPPORT.get(tool.outline)
+    reach = tool.kind.support
     return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
 
 
