@@ -29,8 +29,8 @@ def read_model(
 ) -> tuple[Chain, str]:
     """Read the tree below a body of a model: hinges and slides, and collision geometry as links.
 
-    Capsules, boxes, spheres and cylinders are used directly; meshes are replaced by an enclosing capsule or
-    box. Visual geometry, planes and free joints are left out.
+    Capsules, boxes, spheres and cylinders are used directly; meshes are replaced by a capsule or box of the
+    size of their oriented bounding box. Visual geometry, planes and free joints are left out.
 
     Args:
         model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
