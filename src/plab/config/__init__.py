@@ -1,7 +1,7 @@
 """Configuration of a run: types, composition, checks, and selection of runs.
 
 :func:`load_config` composes the values of ``conf/*.yaml`` and overrides into a :class:`Config`. Names are
-imported on first use: readers of results do without Hydra.
+imported on first use, so that reading results does not import Hydra.
 """
 
 from importlib import import_module
@@ -42,7 +42,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import attributes on first access."""
-    # The types first: composing needs them while it is imported.
+    # Types first, because the import of compose needs them.
     for part in ("task", "run", "suite", "compose") if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")
         if hasattr(module, name):

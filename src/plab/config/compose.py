@@ -1,9 +1,8 @@
 """Composition of a run's configuration from files and overrides, its checks, and its scene.
 
 ``conf/*.yaml`` holds every number, the dataclasses beside this module say which keys there are. Hydra
-composes the files, perhaps with a folder of the user's, and the overrides; :func:`finish` merges the chosen
-variant over the task and returns plain dataclasses, so that nothing that works with them knows Hydra or
-OmegaConf.
+composes the files, optionally with a user's folder, and the overrides. :func:`finish` merges the chosen
+variant over the task and returns plain dataclasses, independent of Hydra and OmegaConf.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from plab.scenes import Scene, vector3
 from plab.targets import check_target, load_release_target
 
 GROUPS = ("task", "method", "protocol", "sim")
-"""Sections of the configuration that are a choice of one file."""
+"""Sections of the configuration that select one file."""
 
 EXPERIMENT = "experiment"
 """Group of files that preset any keys and sweeps over them; added by ``+experiment=``."""
@@ -44,7 +43,7 @@ EXPERIMENT = "experiment"
 
 @dataclasses.dataclass
 class _Composed(Config):
-    """A configuration as Hydra composes it, with a method that has no type yet."""
+    """A configuration as composed by Hydra, with an untyped method."""
 
     method: Any
 
@@ -111,7 +110,7 @@ def load_config(
 
 
 _KEPT: dict[tuple[Any, ...], bytes] = {}
-"""Composed configurations by the overrides that choose files and the state of the user's files."""
+"""Cache of composed configurations, by the overrides that select files and the state of the user's files."""
 
 
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
@@ -122,7 +121,7 @@ def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictC
 
     Args:
         words: Prepared overrides.
-        config_dir: Folder with files of the user's own.
+        config_dir: Folder with the user's files.
 
     Raises:
         ConfigError: If an override or a file does not fit.
@@ -139,7 +138,7 @@ def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictC
         for override in values:
             OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
     except OmegaConfBaseException:
-        # A key that does not exist, a value of the wrong type, a group of the user's: Hydra knows better.
+        # Hydra reports unknown keys, wrong types and the user's groups.
         return _without_hydra(compose_with_hydra(words, config_dir))
     return config
 
@@ -179,12 +178,11 @@ def _sets_a_value(override: Override) -> bool:
 
 
 def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
-    """Refuse choices of files that Hydra would misread, before it composes anything.
+    """Reject selections of files that Hydra would misinterpret, before composition.
 
     Args:
         words: Prepared overrides.
-        config_dir: Folder with files of the user's own; modules that they name are found there from now on,
-            see :mod:`plab.plugins`.
+        config_dir: Folder with the user's files and modules, see :mod:`plab.plugins`.
 
     Raises:
         ConfigError: If a group is not given exactly one choice, or the folder cannot be used.
@@ -218,7 +216,7 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
 
     Args:
         composed: The composed configuration, without Hydra's own section.
-        words: Prepared overrides; one that has no effect is an error.
+        words: Prepared overrides; overrides without effect are errors.
         alone: Whether there is no other run, on which an override about another variant, task or profile
             could have its effect.
 
@@ -231,7 +229,7 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
     try:
         composed.method = _typed_method(composed.method, "method")
         _reject_unknown(composed, "")
-        # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
+        # Hydra closes all dictionaries, but a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
         overrides = parse(words)
         _require_effect(composed, overrides, alone)
@@ -254,14 +252,14 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
-    """Return configurations that differ from one in their scenes, which are drawn: ``variant=random``.
+    """Return copies of a configuration with random scenes (``variant=random``).
 
     Args:
         cfg: The configuration.
         seeds: A ``seed_scene`` for each.
 
     Raises:
-        ConfigError: If the task is not one of the suite as it stands in its file, or has nothing to draw.
+        ConfigError: If the task is not an unmodified task of the suite, or has no section ``random``.
     """
     from plab.config.draws import with_own_materials
 
@@ -296,7 +294,7 @@ def build_scene(cfg: Config) -> Scene:
         The validated scene.
 
     Raises:
-        ConfigError: If the task is another variant's.
+        ConfigError: If the task is that of another variant.
         plab.scenes.SceneError: If the scene cannot be simulated.
     """
     task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
@@ -326,7 +324,7 @@ def build_scene(cfg: Config) -> Scene:
 
 
 def check_sources(cfg: Config) -> None:
-    """Find mistakes in the scene, its memory and its target: ConfigError, SceneError or TargetError."""
+    """Check scene, memory and target; raise ConfigError, SceneError or TargetError."""
     # Imported here: Taichi takes a second.
     from plab.sim.memory import require_memory
 
@@ -339,7 +337,7 @@ def check_sources(cfg: Config) -> None:
 
 
 def require_runnable(cfg: Config) -> None:
-    """Raise ConfigError unless this computer has the device and the optional packages that a run uses."""
+    """Raise ConfigError unless the device and the optional packages of a run are available."""
     # Imported here: Taichi takes a second.
     from plab.sim.runtime import cuda_devices
 
@@ -354,8 +352,8 @@ def require_runnable(cfg: Config) -> None:
 
 
 def _typed_method(method: DictConfig, path: str) -> DictConfig:
-    """Return a section ``method`` with the types of its family; ConfigError if there is no such family, an
-    OmegaConfBaseException if a key or a value does not fit."""
+    """Return a typed section ``method``; ConfigError if there is no such family, an OmegaConfBaseException if
+    a key or a value does not fit."""
     if not isinstance(method, DictConfig) or "family" not in method:
         raise ConfigError(f"{path}.family has no value: name the family, or its module:NAME")
     if isinstance(stages := method.get("stages"), DictConfig):
@@ -374,7 +372,7 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
 def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: bool) -> None:
     """Reject overrides of values that belong to another variant, profile, protocol or task."""
     task, method, variant, protocol = composed.task, composed.method, composed.variant, composed.protocol
-    # By section: the choice that it goes with, and which of its entries counts, if any does.
+    # By section: the related selection, and the entry in use, if any.
     used: dict[str, tuple[str, str | None]] = {}
     if alone:
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
@@ -404,7 +402,7 @@ def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: 
 def _refuse_undone(
     overrides: Sequence[Override], changes: DictConfig, choice: str, place: str = "task.random"
 ) -> None:
-    """Refuse overrides of keys of the task that ``changes`` set again."""
+    """Reject overrides of keys of the task that ``changes`` overwrite."""
     for override in overrides:
         group, _, key = override.key_or_group.partition(".")
         if group == "task" and key and OmegaConf.select(changes, key) is not None:
@@ -412,7 +410,7 @@ def _refuse_undone(
 
 
 def _choose_profile(method: DictConfig) -> None:
-    """Put the chosen profile's values where they are referred to, and forget the profiles."""
+    """Resolve references to the chosen profile, and remove the profiles."""
     if "profiles" not in method or (method.profile is None and not method.profiles):
         return
     if method.profile not in method.profiles:
@@ -422,7 +420,7 @@ def _choose_profile(method: DictConfig) -> None:
 
 
 def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
-    """Put values where they are referred to, except in tables, which are empty afterwards."""
+    """Resolve references to tables, and empty the tables."""
     for key, node in section.items_ex(resolve=False):
         if OmegaConf.is_interpolation(section, str(key)):
             section[key] = section[key]
@@ -441,7 +439,7 @@ def _choose_numbers(composed: DictConfig, overrides: Sequence[Override]) -> None
 
 
 def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None:
-    """Put the variant into the task, drawn if it is to be random, and forget the others."""
+    """Merge the variant, sampled if random, into the task, and remove the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
         from plab.config.draws import draw_variant
@@ -462,7 +460,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
 
 
 def _reject_unknown(node: Any, path: str) -> None:
-    """Refuse keys that no dataclass names; Hydra lets ``+key=value`` add them."""
+    """Reject keys that no dataclass defines; Hydra lets ``+key=value`` add them."""
     if not isinstance(node, DictConfig):
         return
     kind = OmegaConf.get_type(node)

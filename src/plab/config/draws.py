@@ -5,8 +5,8 @@ task and on ``seed_scene``, not on the method's seed, the machine, the grid or t
 
 The section ``randomize``, from which every episode draws anew, is a part of the task's structure, as variants
 are, with a range ``[low, high]`` in place of each number or list of numbers:
-``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Bodies and manipulators have the further
-key ``offset``, bodies ``yaw``, the task ``observation_noise``; ``scenes: 20`` draws one of 20 scenes of
+``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Additional keys are ``offset`` of bodies
+and manipulators, ``yaw`` of bodies, and ``observation_noise``; ``scenes: 20`` selects one of 20 scenes of
 ``variant=random``.
 """
 
@@ -31,16 +31,17 @@ from plab.scenes import MATERIAL_KEYS, Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
 NOISE, SCENE, SCENES = "observation_noise", "scene", "scenes"
-"""Standard deviation of the noise on observations, number of the drawn scene, and how many there are."""
+"""Keys of the standard deviation of observation noise, the number of the sampled scene, and the number of
+scenes."""
 
 _POSITIONS = {"bodies": "center", "manipulators": "position"}
 """Keys of the positions that ``offset`` shifts."""
 
 _FIXED = ("particles", "size", "center", "dt")
-"""Numbers of a body that cannot differ between episodes, or are moved by ``offset``."""
+"""Numbers of a body that cannot be randomised, or only by ``offset``."""
 
 Values = dict[str, Any]
-"""Drawn numbers and lists of numbers by dotted key of the task."""
+"""Sampled numbers and lists of numbers by dotted key of the task."""
 
 
 # ------------------------------------------------------------------------------------------------- episodes
@@ -50,7 +51,7 @@ def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
     """Return the lowest and highest values of sampled parameters, by dotted key, sorted.
 
     Raises:
-        ConfigError: If a range is none, or its key is nothing that can be drawn.
+        ConfigError: If a range is invalid, or its key cannot be randomised.
     """
     found: dict[str, tuple[Any, Any]] = {}
 
@@ -79,10 +80,11 @@ def _range(task: TaskConfig, bounds: Any, key: str) -> tuple[Any, Any]:
 
 
 def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
-    """Return a value of a drawn key as a number or a list of numbers.
+    """Return the value of a randomised key as a number or a list of numbers.
 
     Raises:
-        ConfigError: If the key is nothing that can be drawn, or the value does not fit; begins with ``path``.
+        ConfigError: If the key cannot be randomised, or the value is invalid; the message begins with
+            ``path``.
     """
     present = present_value(task, key, path)
     numbers = np.asarray(value)
@@ -95,8 +97,8 @@ def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
 
 
 def present_value(task: TaskConfig, key: str, path: str) -> Any:
-    """Return the value of a sampled key in the task itself; ConfigError, which begins with ``path``, if the
-    key is nothing that can be drawn."""
+    """Return the value of a sampled key in the task itself; ConfigError, beginning with ``path``, if the key
+    cannot be randomised."""
     group, *rest = key.split(".")
     if key in (NOISE, SCENE):
         return 0
@@ -121,7 +123,7 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
 
 
 def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Values:
-    """Draw a value for each range, uniformly, entry by entry."""
+    """Sample a value for each range, uniformly per entry."""
     values: Values = {}
     for key, (low, high) in bounds.items():
         unit = rng.random(np.shape(low))
@@ -131,7 +133,7 @@ def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Val
 
 def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
     """Return a configuration with some values replaced in the task; ``yaw`` and ``observation_noise`` are not
-    in it."""
+    included."""
     task = copy.deepcopy(cfg.task)
     for key, value in values.items():
         *parts, last = key.split(".")
@@ -149,7 +151,7 @@ def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
 
 
 def yaws(task: TaskConfig, values: Mapping[str, Any]) -> dict[str, float]:
-    """Return the angles by which bodies are turned about vertical axes through their centres [rad]."""
+    """Return the rotation angles of bodies about vertical axes through their centres [rad]."""
     found = {name: float(values.get(f"bodies.{name}.yaw", 0.0)) for name in task.bodies}
     return {name: angle for name, angle in found.items() if angle}
 
@@ -185,15 +187,15 @@ def turned(x: np.ndarray, center: np.ndarray, angle: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------------- variant=random
 
 ATTEMPTS = 100
-"""Maximum number of draws until a scene is valid."""
+"""Maximum number of samples until a scene is valid."""
 
 DECIMALS = 4
 """Number of decimals of sampled numbers, as in the suite's files."""
 
 FIRST_TARGET_SEED = 1000
-"""Drawn seeds of scripted targets are not below this, so that none is that of a variant in a YAML."""
+"""Lower bound of sampled seeds of scripted targets, above those of variants in YAML files."""
 
-# Entropy besides seed_scene, one per purpose; 0 would be the same as none.
+# Additional entropy, one per purpose; 0 would have no effect.
 _NUMBERS, _TARGET_SEED = 1, 2
 
 
@@ -245,7 +247,7 @@ def _target_seed(seed_scene: int) -> int:
 
 
 def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> DictConfig:
-    """Draw all ranges and the displacement once; return them as a part of the task's structure."""
+    """Sample all ranges and the displacement once; return them in the task's structure."""
     changes = OmegaConf.create({})
     for draw in (random.ranges or {}).values():
         values = _uniform(draw, rng)
@@ -259,7 +261,7 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
         for key in [*places, *(["kinematics.position"] if base.kinematics else [])]:
             if OmegaConf.select(changes, key) is None:
                 start = OmegaConf.select(base, key, throw_on_missing=True)
-                # Rounding takes off the digits that adding decimals leaves, nothing else.
+                # Rounding only removes the floating-point residue of adding decimals.
                 moved = [round(a + b, 12) for a, b in zip(start, displacement, strict=True)]
                 OmegaConf.update(changes, key, moved)
     return changes
@@ -291,10 +293,10 @@ def _check(task: TaskConfig, random: RandomConfig) -> None:
 
 
 def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
-    """Raise if the bounding box of a drawn body of a target overlaps another one's; they may touch."""
+    """Raise if the bounding box of a sampled body of a target overlaps another one; they may touch."""
     for (first, a), (second, b) in itertools.combinations(bodies.items(), 2):
         distance = np.abs(np.subtract(a.center, b.center))
         overlap = np.all(distance < a.build(1).half_extent() + b.build(1).half_extent() - 1e-9)
-        # Those that are not drawn stick together by intention.
+        # Bodies that are not sampled may be in contact intentionally.
         if overlap and drawn & {first, second}:
             raise TargetError(f"target.bodies.{first} overlaps target.bodies.{second}")

@@ -1,8 +1,8 @@
-"""Families of methods: the types of their records, and the registry that finds them.
+"""Families of methods: types of their records, and the registry.
 
 A record is at the end of a runner's file, beside the dataclass of the section ``method``; a method's YAML
 names it as ``family: name`` of :data:`FAMILIES`, or as ``module:NAME`` outside plab: see docs/own_method.md.
-These files import no large library before they need it, so that looking up a record stays cheap.
+These files import large libraries only on use, so that looking up a record is fast.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Appearance:
     Attributes:
         label: Name for readers.
         colour: Colour of its curves.
-        dashes: Line style, for those who do not see the colour.
+        dashes: Line style, for readers who cannot distinguish colours.
     """
 
     label: str
@@ -62,16 +62,15 @@ class Family:
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
         columns: Additional columns of the results.
-        may_be_nan: Those of them with entries for which there is no number.
-        ranking: Criterion of the best actions of a run: ``loss``, the lowest, or ``score``, the highest, and
-            of several the one of lowest loss.
-        batching: Whether runs can share a simulator; else each runs alone.
-        in_step: Whether those that share one must have the same section ``method``, as agents that learn in
-            step with each other.
-        rules: Choices of ``method.algorithm`` or ``method.optimizer``, if there is such a key.
-        contact: Contact model in which rows are measured, ``soft`` or ``hard``; None: ``method.contact``.
+        may_be_nan: Columns that may have missing numbers.
+        ranking: Criterion for the best actions of a run: lowest ``loss``, or highest ``score``, with ties
+            broken by loss.
+        batching: Whether runs can share a simulator; otherwise they are executed one by one.
+        in_step: Whether runs of a batch must have the same section ``method``, as agents in lockstep.
+        rules: Choices of ``method.algorithm`` or ``method.optimizer``, if any.
+        contact: Contact model of the rows, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
-        methods: Appearance of methods by name; others appear in grey, by their names.
+        methods: Appearance of methods by name; others are shown in grey.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""Ranges of values, checked by functions that take the key for their message, ``path``, and the value."""
+"""Checks of values: functions of the key, ``path``, for the message, and the value."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plab.errors import ConfigError, pick
 
 
 def folder_name(path: str, value: str) -> None:
-    """Raise :class:`ConfigError` unless a name can be that of a folder."""
+    """Raise :class:`ConfigError` unless a name is valid as a folder name."""
     if not value.replace("_", "").replace("-", "").isalnum():
         raise ConfigError(f"{path} '{value}' must be letters, digits, - and _: it names a folder")
 
@@ -24,13 +24,13 @@ def one_of(path: str, value: str, names: Sequence[str]) -> None:
 
 def positive(path: str, value: float) -> None:
     """Raise :class:`ConfigError` unless a value is positive and finite."""
-    # Written so that nan fails it too, here and below.
+    # NaN must fail this comparison, too, here and below.
     if not 0 < value < math.inf:
         raise ConfigError(f"{path} must be positive and finite, not {value:g}")
 
 
 def at_least(path: str, value: float, low: float, *, finite: bool = False) -> None:
-    """Raise :class:`ConfigError` if a value is below ``low``, or if it has to be finite and is not."""
+    """Raise :class:`ConfigError` if a value is below ``low``, or not finite as required."""
     if not value >= low or (finite and value == math.inf):
         limit = f"{low:g}{' and finite' if finite else ''}"
         raise ConfigError(f"{path} must be at least {limit}, not {value:g}")
@@ -43,7 +43,7 @@ def vector(path: str, value: Sequence[float], length: int) -> None:
 
 
 def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str, Any]:
-    """Return the metadata of a field of a :class:`Section` that a function of this module is to check."""
+    """Return metadata for a field of a :class:`Section`, to be checked by a function of this module."""
     return {"check": lambda path, value: check(path, value, *limits, **options)}
 
 
@@ -64,7 +64,7 @@ UNIT = _in_range("in [0, 1]", lambda value: 0 <= value <= 1)
 DECAYS = _in_range("two numbers in [0, 1)", lambda value: len(value) == sum(0 <= v < 1 for v in value) == 2)
 WIDTHS = _in_range("numbers of at least 1", lambda value: all(width >= 1 for width in value))
 THREADS = COUNT
-"""Metadata of fields; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
+"""Metadata of fields; FINITE includes a lower bound of 0; THREADS and WIDTHS are for torch and its layers."""
 
 
 class Section:

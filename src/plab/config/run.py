@@ -25,16 +25,16 @@ SCORES = ("best", "last")
 
 @dataclass
 class MethodConfig(ranges.Section):
-    """Keys that all methods share; a family of methods adds its own keys in a subclass.
+    """Keys common to all methods; families add their keys in subclasses.
 
     Attributes:
         name: Name of the method in results and reports.
-        family: Family that it belongs to: a key of ``plab.config.families.FAMILIES``, or the ``module:NAME``
-            of a :class:`plab.config.families.Family` outside plab.
+        family: Family: a key of ``plab.config.families.FAMILIES``, or the ``module:NAME`` of a
+            :class:`plab.config.families.Family` outside plab.
         contact: Contact model of the rollouts, ``soft`` or ``hard``; the final evaluation always uses the
             hard one.
         softness: Decay rate alpha of the soft contact [1 / domain unit].
-        loss_weights: Weights of the step loss by the names of its terms; a term of weight 0 is left out.
+        loss_weights: Weights of the loss terms by name; terms of weight 0 are left out.
         loss_terms: Implementation of a loss term: a key of ``plab.losses.TERMS``, or ``module:Class`` of a
             custom class.
     """
@@ -66,8 +66,9 @@ class SimConfig(ranges.Section):
     Attributes:
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
-        memory_mb: Memory of the simulator with a gradient [MB]; checkpoints are spaced to fit.
-        deterministic: Whether CUDA gives the same bits in every run and batch, as the CPU does.
+        memory_mb: Memory budget of the simulator with a gradient [MB]; it determines the spacing of
+            checkpoints.
+        deterministic: Whether CUDA is bitwise reproducible, independent of the batch, as the CPU is.
         grid_size: Grid nodes per axis.
         dt: Time step of one substep [s].
         substeps: Substeps per environment step.
@@ -88,15 +89,15 @@ class SimConfig(ranges.Section):
 
 @dataclass
 class ProtocolConfig(ranges.Section):
-    """Conventions of the paper or of the PlasticineLab release, where the two differ.
+    """Conventions of plab or of the PlasticineLab release.
 
     Attributes:
-        name: Name of the protocol in results and reports; runs of different names are never pooled.
+        name: Name of the protocol in results and reports; runs of different protocols are never averaged.
         start: Generator of the particles' initial positions, ``plab`` or ``release``.
         numbers: Source of the task's numbers, likewise; the release's are in ``task.release``.
         floor: Stencil of particles at the lower faces, likewise.
-        score: Iteration that gives a run's score, ``best`` or ``last``; changes what is read from a result,
-            nothing in it. See :attr:`plab.results.RunResult.score`.
+        score: Iteration that gives a run's score, ``best`` or ``last``; affects the interpretation of a
+            result, not its content. See :attr:`plab.results.RunResult.score`.
         contact: Default of ``method.loss_terms.contact``.
     """
 
@@ -118,7 +119,7 @@ class TargetsConfig:
     """Source of the targets.
 
     Attributes:
-        source: Folder of the original release's target files; None builds the task's recipe.
+        source: Folder of the original release's target files; default: the task's recipe.
     """
 
     source: str | None
@@ -131,21 +132,21 @@ class Config:
     Attributes:
         task: Scene, target and variants.
         method: Method and its hyperparameters.
-        protocol: Conventions of the paper or of the release.
+        protocol: Conventions of plab or of the release.
         sim: Discretisation, precision and device.
         targets: Source of the targets.
-        variant: Name of the task's variant, such as ``1``, or ``random7`` of one that was drawn.
+        variant: Name of the task's variant, such as ``1``, or ``random7`` for a random variant.
         seed_scene: Seed of a random variant; None of other variants.
-        seed_particles: Seed of the particles' initial positions. Simulated targets are made with 0.
+        seed_particles: Seed of the particles' initial positions. Simulated targets use 0.
         observe_particles: Least number of particles in an observation: every (particle count // this)-th.
-        observe_target: Whether observations end with :func:`plab.objective.target_observation`, for policies
-            that are to serve several targets.
+        observe_target: Whether observations include :func:`plab.objective.target_observation`, for policies
+            for several targets.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
-        force: Compute again although a result exists.
+        force: Recompute an existing result.
         progress: Show a progress bar, and hints at the end.
-        logger: Further destination of the rows: ``none``, ``tensorboard`` or ``wandb``.
-        checkpoint_seconds: Time between two checkpoints, from which a killed run resumes [s].
+        logger: Additional logger of rows: ``none``, ``tensorboard`` or ``wandb``.
+        checkpoint_seconds: Interval between checkpoints [s].
     """
 
     task: TaskConfig
@@ -167,7 +168,7 @@ class Config:
 
     @property
     def hash(self) -> str:
-        """SHA-256, in hex, of everything that can change the result."""
+        """SHA-256, in hex, of all keys that can affect the result."""
         return config_hash(self)
 
     @property
@@ -195,10 +196,10 @@ class Config:
         self.sim.check("sim")
 
     def method_as(self, kind: type[Method]) -> Method:
-        """Return the section ``method``, which has to be of the kind that a runner is for.
+        """Return the section ``method``, checked to be of a runner's type.
 
         Raises:
-            TypeError: If it is of another kind.
+            TypeError: If it has another type.
         """
         if not isinstance(self.method, kind):
             raise TypeError(
@@ -217,19 +218,19 @@ RUN_ONLY_KEYS = ("results_dir", "force", "progress", "logger", "checkpoint_secon
 
 _NO_EFFECT = {
     "": RUN_ONLY_KEYS,
-    # Gradients are the same bits for any spacing of checkpoints.
+    # Gradients are bitwise independent of the spacing of checkpoints.
     "sim": ("memory_mb",),
-    # Name and score change no number, and the contact term is that of the method.
+    # Name and score do not affect numbers, and the contact term is set by the method.
     "protocol": ("name", "score", "contact"),
     "task": ("release", "cameras", "stages"),
 }
-"""Configuration keys by section that cannot change a result, hence are left out of the hash."""
+"""Configuration keys by section that cannot affect a result and are left out of the hash."""
 
 
 def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
     """Return a :class:`Config`, or a mapping, as plain dictionaries and lists.
 
-    Optional keys of bodies that have no value, such as ``file``, are left out, and so are ``kinematics``,
+    Optional keys of bodies without a value, such as ``file``, are left out, as are unused ``kinematics``,
     ``randomize``, ``cameras`` and ``stages`` of a task.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
@@ -245,7 +246,7 @@ def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
 
 
 def config_hash(cfg: Config | Mapping[str, Any]) -> str:
-    """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
+    """Return the SHA-256, in hex, of all keys of a configuration that can affect a result."""
     plain = config_dict(cfg)
     for section, keys in _NO_EFFECT.items():
         part = plain[section] if section else plain
@@ -253,7 +254,7 @@ def config_hash(cfg: Config | Mapping[str, Any]) -> str:
             part.pop(key, None)
     _drop_places(plain["task"])
     if isinstance(lookup(plain, "targets.source"), str):
-        # The target comes from a file, whatever the task's recipe is.
+        # The target is read from a file, so the recipe does not matter.
         for task in (plain["task"], *plain["task"].get("variants", {}).values()):
             task.pop("target", None)
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
@@ -268,6 +269,6 @@ def _drop_places(node: Any) -> None:
 
 
 def member_name(config: Mapping[str, Any], digest: str) -> Path:
-    """Return a run's place inside a results folder or an archive, by its configuration and its hash."""
+    """Return a run's path inside a results folder or an archive, given its configuration and hash."""
     folder = Path(f"{config['task']['name']}-v{config['variant']}") / config["method"]["name"]
     return folder / f"seed{config['seed']}-{digest[:8]}{SUFFIX}"

@@ -1,4 +1,4 @@
-"""Selection of runs by the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
+"""Selection of runs by overrides as in a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
 
 from __future__ import annotations
 
@@ -28,23 +28,22 @@ class Selection:
     keys: dict[str, list[str]] = field(default_factory=dict)
 
     def __call__(self, values: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-        """Return whether a run with these values of the names and this configuration is among the chosen
-        ones."""
+        """Return True if a run with these names and this configuration is selected."""
         return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
             any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
         )
 
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
-    """Read the words of a command line, ``name=value``, with several values as in a sweep.
+    """Parse selections of a command line, ``name=value``, with several values as in a sweep.
 
     Args:
         words: Such as ``seed=0,1,2`` or ``seed=range(3)``.
-        names: Names that runs are chosen by; every dotted name is a key of the configuration.
+        names: Names for selecting runs; dotted names are keys of the configuration.
 
     Raises:
-        ArgumentError: If a word is of another name, or changes more than a value.
-        ConfigError: If a word cannot be read, or gives no value.
+        ArgumentError: If a name is unknown, or a selection does more than compare a value.
+        ConfigError: If a selection cannot be parsed, or has no value.
     """
     if not words:
         return Selection()
@@ -65,8 +64,8 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the name of the protocol that runs have in common, plab's own where there are none;
-    ArgumentError if there are several: they are not to be pooled."""
+    """Return the name of the common protocol of some runs, plab's own for none; ArgumentError if there are
+    several, which must not be averaged."""
     names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
     if len(names) > 1:
         advice = f"choose one, for example protocol.name={names[0]}"
@@ -75,7 +74,7 @@ def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """Return a configuration's value of a dotted key, NaN where there is none."""
+    """Return a configuration's value of a dotted key, or NaN."""
     value: Any = config
     for part in key.split("."):
         value = value.get(part, math.nan) if isinstance(value, Mapping) else math.nan
@@ -83,7 +82,7 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 def _same(value: Any, text: str) -> bool:
-    """Return whether a configuration's value equals a text: numbers by value, all else by letter."""
+    """Return whether a configuration's value equals a text: numbers by value, others literally."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower() == text.lower()
     try:
@@ -93,8 +92,8 @@ def _same(value: Any, text: str) -> bool:
 
 
 def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
-    """Raise ArgumentError for a value that none of the :class:`plab.results.Row` has and no run of the suite
-    could have, such as a misspelt task: it is a mistake, not an empty table."""
+    """Raise ArgumentError for a value that no :class:`plab.results.Row` has and no run of the suite can have,
+    such as a misspelt task, instead of returning an empty table."""
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
         known = list(SUITE_VARIANTS) if name == "variant" else group_names(name)

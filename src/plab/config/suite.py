@@ -21,7 +21,7 @@ PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
 """Methods that the paper compares, in its order."""
 
 PAPER_SEEDS = ("0", "1", "2")
-"""As many seeds as the paper runs of each configuration."""
+"""Seeds of the paper for each configuration."""
 
 
 def conf_folder() -> Path:

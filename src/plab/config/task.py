@@ -32,19 +32,19 @@ class BodyConfig(ranges.Section):
 
     Attributes:
         shape: ``sphere``, ``box`` or ``mesh``.
-        center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
+        center: Centre (x, y, z) [domain units]; for a mesh, of its bounding box.
         size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
             its bounding box; it keeps its proportions.
         particles: Number of particles before ``sim.particles_scale``.
-        file: Mesh only: OBJ, STL or PLY file, y up. A relative one is looked for in the working directory, in
-            the config folder and in the folder above it.
+        file: Mesh only: OBJ, STL or PLY file, y up. A relative path is searched for in the working directory,
+            in the config folder and in its parent folder.
         sha256: Mesh only: SHA-256 of the file. Found out where it is not given; refused if it is another one.
-        youngs_modulus: Young's modulus E; the task's where it is not given, and so on.
+        youngs_modulus: Young's modulus E; default: the task's, as for the following keys.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
         law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or ``module:NAME`` of your own;
             ``von_mises`` where it is not given.
-        parameters: Other parameters of the law, by name; its defaults where they are not given.
+        parameters: Other parameters of the law, by name; default: the law's.
     """
 
     shape: str
@@ -60,11 +60,11 @@ class BodyConfig(ranges.Section):
     parameters: dict[str, float] = field(default_factory=dict)
 
     def build(self, particles_scale: float = 1.0) -> Body:
-        """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
+        """Return the scene's body, with the number of particles scaled by ``particles_scale``, at least one.
 
         Raises:
-            plab.scenes.SceneError: If a mesh has no file, or something else has one.
-            plab.files.ShapeError: If the file does not do.
+            plab.scenes.SceneError: If a mesh has no file, or another shape has one.
+            plab.files.ShapeError: If the file is invalid.
         """
         particles = max(1, round(self.particles * particles_scale))
         material = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law", "parameters")}
@@ -77,7 +77,7 @@ class ManipulatorConfig(ranges.Section):
 
     Attributes:
         shape: A key of :data:`plab.scenes.MANIPULATOR_SHAPES`.
-        size: Lengths that the shape asks for [domain units].
+        size: Lengths of the shape [domain units].
         position: Position (x, y, z) at the start [domain units].
         rotation: Unit quaternion (w, x, y, z) at the start.
         scale: Motion per environment step at action 1, one per action component [domain units or radians].
@@ -128,17 +128,17 @@ class KinematicsConfig(ranges.Section):
         model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
         root: Body whose frame is placed in the domain; default: the model's world frame.
         size: Domain units per unit of length of the model.
-        position: Place (x, y, z) of that frame's origin [domain units].
-        rotation: Unit quaternion (w, x, y, z) from that frame's axes to the domain's; turns z up into y up if
-            not given.
+        position: Position (x, y, z) of the origin of that frame [domain units].
+        rotation: Unit quaternion (w, x, y, z) from that frame's axes to the domain's; default: z up becomes y
+            up.
         free: Whether the base moves, by the joints ``base_x``, ``base_y``, ``base_z``, ``base_yaw``,
             ``base_pitch`` and ``base_roll``.
         scale: Motion per environment step at action 1, by patterns of joints [rad or domain units]; joints
-            without one stay where they start.
-        start: Positions at the start, by patterns of joints; 0, or the limit next to it, if not given.
-        limits: Lowest and highest positions, by patterns of joints; the model's if not given.
-        together: Patterns of joints that one component of the action moves, by its name.
-        omit: Patterns of collision geometry that is left out.
+            without one are fixed.
+        start: Initial positions, by patterns of joints; default: 0, or the nearest limit.
+        limits: Lowest and highest positions, by patterns of joints; default: the model's.
+        together: Patterns of joints driven by one action component, by its name.
+        omit: Patterns of collision geometry to leave out.
         friction: Coulomb friction of all links with the plasticine.
         sha256: SHA-256 of the tree. Found out where it is not given; refused if it is another one.
     """
@@ -176,7 +176,7 @@ class KinematicsConfig(ranges.Section):
         """Return the scene's articulated model.
 
         Raises:
-            ConfigError: If the model cannot be read, is another one, or a pattern matches nothing.
+            ConfigError: If the model cannot be read or has changed, or a pattern matches nothing.
         """
         from plab.kinematics import ModelError
 
@@ -187,8 +187,8 @@ class KinematicsConfig(ranges.Section):
             raise ConfigError(f"task.kinematics: {error}") from None
 
     def pin(self) -> None:
-        """Replace the model's name by where it is, unless it is in a package, and note its SHA-256; errors as
-        of :meth:`build`."""
+        """Replace the model's name by its path, unless it is in a package, and add its SHA-256; errors as for
+        :meth:`build`."""
         from plab.kinematics import ModelError, locate_model
 
         try:
@@ -213,7 +213,7 @@ class KinematicsConfig(ranges.Section):
 
 @dataclass
 class RangeConfig:
-    """Numbers that are drawn uniformly and independently, each between its two bounds.
+    """Numbers sampled uniformly and independently, each between two bounds.
 
     Attributes:
         low: Lower bounds.
@@ -224,7 +224,7 @@ class RangeConfig:
     high: list[float]
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for bounds with nothing between them."""
+        """Raise :class:`ConfigError` for empty ranges."""
         ranges.vector(f"{path}.low", self.low, len(self.low))
         ranges.vector(f"{path}.high", self.high, len(self.low))
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
@@ -233,10 +233,10 @@ class RangeConfig:
 
 @dataclass
 class DrawConfig(RangeConfig):
-    """A drawn list of numbers, and where it goes.
+    """A sampled list of numbers, and the keys that receive it.
 
     Attributes:
-        keys: Dotted keys of the task that take the same drawn list, such as ``manipulators.pillar.position``.
+        keys: Dotted keys of the task that receive the sampled list, such as ``manipulators.pillar.position``.
     """
 
     keys: list[str]
@@ -244,15 +244,15 @@ class DrawConfig(RangeConfig):
 
 @dataclass
 class RandomConfig(ranges.Section):
-    """Ranges that ``variant=random`` draws from.
+    """Ranges of ``variant=random``.
 
     Attributes:
-        variant: Variant with the values that are not sampled; None where the task itself gives it.
+        variant: Variant with the values that are not sampled; default: the task itself.
         shift: Common displacement (x, y, z) of all bodies and moving manipulators, except those with their
-            own range [domain units]. None leaves them where they are.
+            own range [domain units]. default: none.
         reach: Largest distance along an axis between a body and the target's body of the same name; samples
             beyond it are rejected [domain units]. None sets no limit.
-        ranges: Further drawn lists, by names of your choice.
+        ranges: Further sampled lists, by name.
     """
 
     variant: str | None = None
@@ -292,10 +292,10 @@ class TaskConfig(ranges.Section):
         randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.draws`; empty: no
             randomisation.
         cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
-        stages: Targets, as ``target``, that environments ask for one after the other before ``target``; runs
-            know ``target`` alone.
-        release: Numbers of the PlasticineLab release where they differ, merged over this structure, variants
-            included, by ``protocol.numbers=release``. Empty in a run's configuration.
+        stages: Targets, like ``target``, that environments present in sequence before ``target``; runs use
+            only ``target``.
+        release: Overrides with the numbers of the PlasticineLab release, including variants, for
+            ``protocol.numbers=release``. Empty in a run's configuration.
     """
 
     name: str = field(metadata=ranges.NAME)
@@ -344,7 +344,7 @@ class TaskConfig(ranges.Section):
         """Return the scene's bodies, see :meth:`BodyConfig.build`.
 
         Raises:
-            ConfigError: If one cannot be made; names its key.
+            ConfigError: If a body is invalid; the message names its key.
         """
         bodies = []
         for name, body in self.bodies.items():
@@ -366,7 +366,7 @@ class TaskConfig(ranges.Section):
         """Replace the name of each file by its path, and add the SHA-256 of its content.
 
         Raises:
-            ConfigError: If a file is missing, cannot be read, or holds something else; names its key.
+            ConfigError: If a file is missing, unreadable or of another kind; the message names its key.
         """
         if self.kinematics is not None:
             self.kinematics.pin()

@@ -1,4 +1,4 @@
-"""Overrides in Hydra's grammar: prepared, parsed, multiplied into the runs of a sweep, and explained."""
+"""Overrides in Hydra's grammar: preparation, parsing, expansion of sweeps, and error messages."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ConfigError, pick
 
 RANDOM = "random"
-"""Name of the variant that is drawn instead of looked up."""
+"""Name of the random variant."""
 
 FOLDERS = ("results_dir", "targets.source")
 """Keys with folder names as values."""
 
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
-"""Infinity and NaN as YAML writes them."""
+"""Infinity and NaN in YAML's notation."""
 
 
 def prepared(words: Sequence[str]) -> list[str]:
@@ -43,15 +43,15 @@ def _quote_path(word: str) -> str:
     key, _, text = word.partition("=")
     own = key.lstrip("+")
     is_path = own in FOLDERS or (own.startswith("task.") and own.endswith(".file"))
-    # Quoted texts, null, interpolations, and several values for a sweep stay.
+    # Quoted texts, null, interpolations, and several values of a sweep are unchanged.
     if not is_path or text == "null" or not text.strip() or re.search(r"[,'\"]|\$\{|^\w+\(", text):
         return word
     return f"{key}={quoted(text)}"
 
 
 def quoted(text: str) -> str:
-    """Return a text as Hydra reads it letter by letter."""
-    # Backslashes count for themselves, unless a quote follows.
+    """Return a quoted text that Hydra reads literally."""
+    # Backslashes are literal, unless followed by a quote.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + (r"\'" if found[2] else ""), text)
     return f"'{escaped}'"
 
@@ -66,7 +66,7 @@ def parse(words: Sequence[str]) -> list[Override]:
 
 @functools.lru_cache(maxsize=1024)
 def _parsed(word: str) -> Override:
-    """Parse one override; those of a sweep come again in many of its jobs."""
+    """Parse one override; cached, because jobs of a sweep share overrides."""
     (override,) = OverridesParser.create().parse_overrides([word])
     return override
 
@@ -128,7 +128,7 @@ COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionEr
 
 
 def explain(error: Exception) -> str:
-    """Return one line, without a full stop, on one of :data:`COMPOSE_ERRORS`."""
+    """Return a one-line message, without a full stop, for one of :data:`COMPOSE_ERRORS`."""
     if isinstance(error, RecursionError):
         return "the configuration refers to itself: look at defaults and ${...}"
     if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|ray|submitit)", str(error)):
@@ -155,7 +155,7 @@ def explain(error: Exception) -> str:
 
 def _omegaconf_cause(error: BaseException | None) -> OmegaConfBaseException | None:
     while error is not None and not isinstance(error, OmegaConfBaseException):
-        # Hydra raises some of its errors while it handles another, without naming it as the cause.
+        # Hydra raises some errors while handling another, without setting the cause.
         error = error.__cause__ or error.__context__
     return error
 
@@ -168,7 +168,7 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     if not names:
         above = key.rpartition(".")[0]
         return f"unknown key '{key}': {above} has none; if it refers to another key, override that one"
-    # lr=0.1 instead of method.lr=0.1: name the key that ends like it.
+    # For lr=0.1 instead of method.lr=0.1, suggest the key with this ending.
     deeper = [path for path in _paths(parent) if path.rpartition(".")[2] == last] if "." not in key else []
     if deeper:
         return f"unknown key '{key}'; did you mean {' or '.join(deeper[:3])}? choose from: {', '.join(names)}"
@@ -176,7 +176,7 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
 
 
 def _paths(node: object, prefix: str = "") -> Iterator[str]:
-    """Dotted paths of all keys of dataclass nodes below a node, and of a method that has no type yet."""
+    """Return the dotted paths of all keys of dataclass nodes below a node, and of an untyped method."""
     if not isinstance(node, DictConfig):
         return
     if prefix != "method." and not dataclasses.is_dataclass(OmegaConf.get_type(node)):

@@ -1,7 +1,7 @@
-"""Environments: the tasks for reinforcement learning, through Gymnasium and Stable-Baselines3.
+"""Environments: tasks as Gymnasium and Stable-Baselines3 environments.
 
 Importing plab registers ``plab/<Task>-v<variant>`` for every task of the suite and its five variants. This
-module imports neither Taichi nor torch nor Hydra; making an environment does.
+module does not import Taichi, torch or Hydra; creating an environment does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ENTRY_POINT = "plab.envs.single:PlabEnv"
 
 
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Make an environment of the suite.
+    """Create an environment of the suite.
 
     Args:
         task: Name of the task, such as ``Rope``.
@@ -36,7 +36,7 @@ def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any,
 def make_vec(
     task: str, variant: str | int = 1, num_envs: int = 1, **kwargs: Any
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """Make several environments of the suite that share one simulator.
+    """Create several environments of the suite that share one simulator.
 
     Args:
         task: Name of the task, such as ``Rope``.
@@ -62,8 +62,7 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
     Args:
         task: Name of the task, a file of ``task/`` in plab's own folder or in ``config_dir``.
         variants: Numbers of its variants.
-        **kwargs: Arguments of :class:`plab.envs.single.PlabEnv` that are always the same, such as
-            ``config_dir``.
+        **kwargs: Fixed arguments of :class:`plab.envs.single.PlabEnv`, such as ``config_dir``.
     """
     for variant in variants:
         env_id = f"plab/{task}-v{variant}"
@@ -73,7 +72,7 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
             vector_entry_point="plab.envs.vector:PlabVectorEnv",
             kwargs={"task": task, "variant": variant, **kwargs},
         )
-        # To Gymnasium a version is a revision, and every one but the highest out of date: it would warn of
-        # v1 to v4. Variants are no revisions, so the number is made a part of the name.
+        # Gymnasium treats versions as revisions and would warn that v1 to v4 are out of date. Variants are
+        # not revisions, so the number is part of the name.
         spec = gymnasium.registry[env_id]
         spec.name, spec.version = f"{task}-v{variant}", None

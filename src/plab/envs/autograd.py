@@ -30,9 +30,9 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
     """Simulate actions from the initial states and return the trajectory losses, differentiable with respect
     to the actions.
 
-    The contact model is the one that the problem's simulator is set to. The gradient is that of a sequence of
-    actions: what else the actions depend on, such as observations, is outside it. Where an action lies beyond
-    [-1, 1], it is clipped and has no gradient. The gradient is computed together with the losses if the
+    The contact model is that of the problem's simulator. The gradient is for a sequence of independent
+    actions: it does not include dependencies of the actions, such as on observations. Actions outside [-1, 1]
+        are clipped and have no gradient. The gradient is computed together with the losses if the
     actions require gradients; second derivatives are not supported.
 
     Args:
@@ -41,17 +41,17 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
             simulator's precision.
 
     Returns:
-        Sum of the weighted step losses of each environment, shape [batch], like ``actions`` in type and
-        device.
+        Sum of the weighted step losses of each environment, shape [batch], with the type and device of
+        ``actions``.
 
     Raises:
         TypeError: If the actions are complex.
         ValueError: If the shape is wrong or an action is not finite.
-        plab.sim.SimulationError: If state, loss or gradient stop being finite.
+        plab.sim.SimulationError: If state, loss or gradient diverge.
         MemoryError: If the gradient does not fit the memory budget.
     """
     actions = floating(actions, problem.simulator)
-    # Within an autograd.Function recording is always off.
+    # Inside an autograd.Function, gradient recording is always disabled.
     return _Rollout.apply(actions, problem, actions.requires_grad and torch.is_grad_enabled())
 
 
@@ -81,7 +81,7 @@ def _numbers(tensor: torch.Tensor) -> np.ndarray:
 
 
 class States(NamedTuple):
-    """States after environment steps, each of shape [batch, T, ...]; T is 1 for the last state alone.
+    """States after environment steps, each of shape [batch, T, ...]; T is 1 for the last state only.
 
     Attributes:
         x: Particle positions [domain units], shape [batch, T, particle, 3].
@@ -105,34 +105,32 @@ def simulate(
     material: torch.Tensor | None = None,
     **initial: torch.Tensor,
 ) -> States:
-    """Run actions and return the states that they lead to, for any function of them that PyTorch can
-    differentiate.
+    """Simulate actions and return the states, for arbitrary differentiable PyTorch functions of them.
 
-    The function's gradient reaches actions, initial state and material. The contact model is the one that the
-    simulator is set to; terms of a loss that it was built with play no part. ``backward`` has to be called
-    before the simulator runs again. The derivative by a quaternion is that of the rotation matrix's
-    polynomial.
+    Gradients are propagated to actions, initial state and material. The contact model is the simulator's; its
+    loss terms are not used. Call ``backward`` before the simulator is used again. Derivatives with respect to
+    quaternions are those of the rotation matrix as a polynomial.
 
     Args:
-        simulator: The simulator; built with ``full_gradient=True`` where initial state or material require a
-            gradient.
+        simulator: The simulator; it needs ``full_gradient=True`` if initial state or material require
+            gradients.
         actions: Actions, shape [batch, T, A], on any device; integers become floating-point numbers of the
             simulator's precision.
-        every_step: Return the state after every environment step, not the last one alone.
+        every_step: Return the state after every environment step instead of only the last one.
         mass: Return mass tensors, too.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] if
             bodies have their own materials; default: unchanged.
-        **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. The simulator keeps
-            them, as it does the material.
+        **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. They are stored in
+            the simulator, as is the material.
 
     Returns:
         The states, like ``actions`` in type and device.
 
     Raises:
-        TypeError: If ``initial`` names something else, or the actions are complex.
+        TypeError: If ``initial`` has unknown names, or the actions are complex.
         ValueError: If a shape is wrong or an action is not finite.
         plab.scenes.SceneError: If the material cannot be simulated.
-        plab.sim.SimulationError: If state or gradient stop being finite.
+        plab.sim.SimulationError: If state or gradient diverge.
         MemoryError: If the gradient does not fit the memory budget.
         RuntimeError: If a gradient is requested after the simulator has been used again, or requires
             ``full_gradient=True``.
@@ -208,7 +206,7 @@ class PolicySteps(NamedTuple):
     """Some steps of a policy in a batch of episodes.
 
     Attributes:
-        observations: Before each step and after the last, shape [T + 1, batch, entry].
+        observations: Observations before each step and after the last, shape [T + 1, batch, entry].
         actions: Shape [T, batch, A].
         terms: Unweighted loss terms after each step, shape [T, batch, term].
         loss: Weighted step losses, shape [T, batch].
@@ -229,31 +227,31 @@ def policy_gradient(
     discount: float = 1.0,
     value: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> PolicySteps:
-    """Run a policy from where a batch of episodes stands, and add the gradient of its loss to the ``grad`` of
-    its parameters.
+    """Run a policy from the current states of a batch of episodes, and add the gradient of its loss to the
+    ``grad`` of its parameters.
 
     The loss is the mean over the environments of the discounted step losses, less the discounted value of the
     last observation. The gradient is complete: it includes the simulated states and the effect of each action
-    on later observations, and thereby on later actions. A policy may draw its actions, as functions of noise
-    (``rsample``).
+    on later observations, and thereby on later actions. A policy may be stochastic, with reparameterised
+    samples (``rsample``).
 
     Args:
         batch: Episodes that were :meth:`~plab.envs.core.EpisodeBatch.reset`; they advance.
-        policy: Maps observations, shape [batch, entry], to actions, shape [batch, A], which are clipped to
+        policy: Function from observations, shape [batch, entry], to actions, shape [batch, A], clipped to
             [-1, 1]; on the simulator's device. Observations have the type of its parameters.
         steps: Steps T.
-        parameters: Parameters of the policy; None: those of a module.
+        parameters: Parameters of the policy; default: those of a module.
         discount: Discount factor: the loss of step t is weighted by ``discount ** t``, the value by
             ``discount ** T``.
-        value: Maps observations to values, shape [batch]; its parameters get no gradient.
+        value: Function from observations to values, shape [batch]; its parameters receive no gradient.
 
     Returns:
         Observations, actions and losses, without gradients.
 
     Raises:
         ValueError: If an action has another shape or is not finite.
-        gymnasium.error.ResetNeeded: If the episodes have fewer steps left.
-        plab.sim.SimulationError: If a state, loss or gradient stops being finite.
+        gymnasium.error.ResetNeeded: If the episodes have fewer remaining steps.
+        plab.sim.SimulationError: If a state, loss or gradient diverges.
         MemoryError: If the gradient does not fit the memory budget.
     """
     own = cast(torch.nn.Module, policy).parameters() if parameters is None else parameters
@@ -274,7 +272,7 @@ def policy_gradient(
         return given(done[t])
 
     def react(t: int, actions_bar: Any) -> Any:
-        """Add to the parameters' gradients; return the derivative by the observation."""
+        """Add to the gradients of the parameters; return the derivative with respect to the observation."""
         if t == steps:
             return react_to_value()
         bar = torch.as_tensor(actions_bar).to(like)

@@ -1,4 +1,4 @@
-"""Batch of episodes in one simulator, below the environments of all libraries.
+"""Batch of episodes in one simulator, the common base of all environments.
 
 The environments for Gymnasium, Stable-Baselines3 and PyTorch are thin adapters of an :class:`EpisodeBatch` to
 the interface of each library.
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 Array: TypeAlias = Any
-"""A NumPy array, or a CUDA tensor where the caller gave one."""
+"""A NumPy array, or a CUDA tensor if the caller passed one."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 """Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
@@ -55,11 +55,11 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 _LOCK = threading.RLock()
-"""Held by the simulating thread: Taichi compiles and launches kernels for one thread at a time."""
+"""Held by the simulating thread, because Taichi compiles and launches kernels for one thread at a time."""
 
 
 def _alone(method: _Method) -> _Method:
-    """Let threads call a method one after the other."""
+    """Serialise calls of a method from several threads."""
 
     @functools.wraps(method)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -83,7 +83,7 @@ def make_batch(
     config_dir: str | Path | None = None,
     **options: Any,
 ) -> EpisodeBatch:
-    """Make the episodes of an environment.
+    """Create the episodes of an environment.
 
     Args:
         task: Name of the task.
@@ -96,7 +96,7 @@ def make_batch(
         **options: Keyword arguments of :class:`EpisodeBatch`.
 
     Raises:
-        ValueError: If an argument does not fit; see also :class:`EpisodeBatch`.
+        ValueError: If an argument is invalid; see also :class:`EpisodeBatch`.
     """
     cfgs = compose_configs(
         task,
@@ -132,7 +132,7 @@ def compose_configs(
         The checked configurations.
 
     Raises:
-        ValueError: If the numbers do not fit, or overrides are no lists or name a task.
+        ValueError: If numbers do not match, or overrides are not lists or set the task.
         plab.config.ConfigError: If an override or a file does not fit.
     """
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
@@ -163,7 +163,7 @@ def check_render_mode(render_mode: str | None) -> str | None:
 
 @dataclass(frozen=True)
 class Transition:
-    """Result of one step of all sub-environments. The arrays are the caller's.
+    """Result of one step of all sub-environments. The caller owns the arrays.
 
     Attributes:
         observation: Observations, shape [batch, entry], float32, or by key.
@@ -185,7 +185,7 @@ class Transition:
 
     @property
     def over(self) -> np.ndarray:
-        """Mask of the episodes that have ended, for whatever reason, shape [batch]."""
+        """Mask of the episodes that have ended for any reason, shape [batch]."""
         return self.terminated | self.cut_off
 
     @property
@@ -205,12 +205,12 @@ class EpisodeState:
         simulation: Particles and manipulators, shape [batch, ...] each.
         failures: Diverged environments.
         last: Observations, loss terms, IoU and, if requested, impulses of the last step.
-        seeds: Entropy of the environments' draws.
+        seeds: Entropy of the environments' randomisation.
         episodes: Numbers of the episodes, shape [batch].
-        over: Which episodes have ended by a success or at the horizon, shape [batch].
+        over: Masks of the episodes that have ended by success or at the horizon, shape [batch].
         values: Sampled parameters of each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
-        stages: Numbers, earnings and scores of the stages; empty where there are none.
+        stages: Numbers, accumulated rewards and scores of the stages; empty without stages.
     """
 
     steps: np.ndarray | None
@@ -226,7 +226,7 @@ class EpisodeState:
 
 
 class EpisodeBatch:
-    """Sub-environments in one simulator, which advances them together.
+    """Sub-environments simulated as one batch.
 
     Attributes:
         configs: One configuration per sub-environment.
@@ -260,25 +260,25 @@ class EpisodeBatch:
         Args:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
             contact: Contact model, ``hard`` or ``soft``.
-            observe: One of :data:`plab.envs.observations.OBSERVATIONS`; or several, which makes observations
-                a dictionary with keys such as ``state`` and ``front_depth``.
-            cameras: Cameras by name, or their attributes; those of the task if None, or one named ``front``.
+            observe: One of :data:`plab.envs.observations.OBSERVATIONS`; or several, for dictionaries with
+                keys such as ``state`` and ``front_depth``.
+            cameras: Cameras by name, or their attributes; default: the task's, or one named ``front``.
             randomize: Ranges of randomised parameters, replacing those of the tasks, see
                 :mod:`plab.config.draws`; empty: none.
-            impulses: Whether ``info`` has the impulses on the manipulators; so it has if they are observed.
-            stages: Whether episodes ask for the targets of ``task.stages`` first; :func:`make_batch` sets it.
-            success_score: Score from which on a state is a success.
+            impulses: Whether ``info`` contains the impulses on the manipulators; always if they are observed.
+            stages: Whether episodes begin with the targets of ``task.stages``; set by :func:`make_batch`.
+            success_score: Least score of a success.
             terminate_on_success: Whether a success ends the episode.
             render_size: Width and height of pictures [pixels].
-            render_target: Whether pictures show the target, as a ghost.
+            render_target: Whether pictures show the target as a translucent shape.
 
         Raises:
             ValueError: If the contact model or an observation does not exist.
-            plab.config.ConfigError: If the configurations do not fit together, or a range does not do.
-            plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+            plab.config.ConfigError: If the configurations are incompatible, or a range is invalid.
+            plab.scenes.SceneError: If a scene cannot be simulated or the scenes cannot share a simulator.
             plab.targets.TargetError: If a target cannot be built.
             plab.sim.DeviceError: If CUDA is not available.
-            RuntimeError: If this process was forked from one that has made environments.
+            RuntimeError: If this process was forked from one with environments.
         """
         if contact not in CONTACTS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
@@ -302,15 +302,15 @@ class EpisodeBatch:
 
     @_alone
     def renew(self, cfgs: Sequence[Config]) -> None:
-        """Replace the sub-environments by others of the same kind, without compiling; the episodes start at
-        :meth:`reset`.
+        """Replace the sub-environments by others of the same kind, without recompilation; the episodes start
+        at :meth:`reset`.
 
         Args:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
 
         Raises:
             ValueError: If their number or the entries of observations differ.
-            plab.config.ConfigError: If the configurations do not fit together.
+            plab.config.ConfigError: If the configurations are incompatible.
             plab.scenes.SceneError: If a scene cannot be simulated or is of another kind.
             plab.targets.TargetError: If a target cannot be built.
         """
@@ -321,7 +321,7 @@ class EpisodeBatch:
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
         if self.draws.changed or self._stages or kinds_of(cfgs) != kinds_of(self.configs):
-            # After an error half way, the batch belongs to no configurations.
+            # After an error, the batch is not associated with any configurations.
             self.configs: tuple[Config, ...] = ()
             simulator.set_scenes(scenes)
             problem = Problem(cfgs, simulator)
@@ -330,7 +330,7 @@ class EpisodeBatch:
         self._begin()
 
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
-        """Return configurations, one object where they are alike, with the ranges to draw from."""
+        """Return configurations, with one object for equal ones, and their ranges."""
         unique = {id(cfg): cfg for cfg in cfgs}
         for key, cfg in unique.items():
             if self._randomize is not None:
@@ -366,7 +366,7 @@ class EpisodeBatch:
         self._observe_starts()
 
     def _observe_starts(self) -> None:
-        """Measure and observe the initial states of all environments, in which they are."""
+        """Measure and observe the current states of all environments as initial states."""
         self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
@@ -386,7 +386,7 @@ class EpisodeBatch:
 
     @property
     def over(self) -> np.ndarray:
-        """Mask of the episodes that have ended and are to be reset, shape [batch]."""
+        """Mask of the ended episodes, which need a reset, shape [batch]."""
         over = self._over.copy()
         over[list(self._failures)] = True
         return over
@@ -408,19 +408,19 @@ class EpisodeBatch:
         """Start the next episodes of all sub-environments, or of some.
 
         Args:
-            like: Given a CUDA tensor, everything returned is one too.
-            environments: Numbers of those that start an episode; all if None.
+            like: If a CUDA tensor, results are CUDA tensors.
+            environments: Numbers of the sub-environments to reset; default: all.
             seeds: Seeds of these environments, which restart their random sequences; default: continue.
             episode: Number of the episodes, which determines the samples; default: the next.
             options: Values by dotted key of the task that replace samples, for all of these or, with a first
                 axis of the batch's length, one for each.
 
         Returns:
-            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch]; of
-            the others those of their last step.
+            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch]. Other
+            sub-environments keep those of their last step.
 
         Raises:
-            ValueError: If an option does not fit.
+            ValueError: If an option is invalid.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         if self._simulator.changes != self._changes:
@@ -458,7 +458,7 @@ class EpisodeBatch:
         return mapped(_copy, observation), self._info(*measured)
 
     def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
-        """Score and reward environments by the initial states, in which they are."""
+        """Use the current states as initial states for scores and rewards."""
         self._changes = self._simulator.changes
         self._close_renderers()
         self._sensors.refresh()
@@ -469,7 +469,7 @@ class EpisodeBatch:
         self._observer = Observer(self.problem, self.configs[0])
 
     def _keep(self, before: tuple[Array, ...], rows: Sequence[int]) -> None:
-        """Keep the last observations and measures of some environments."""
+        """Store the last observations and measures of some environments."""
         if rows:
             for table, old in zip(self._last, before, strict=True):
                 mapped(lambda now, then: _restore_rows(now, then, rows), table, old)
@@ -486,20 +486,20 @@ class EpisodeBatch:
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. For a CUDA tensor, results are
                 tensors on the same device, without copies to the host.
-            strict: Whether divergence of a sub-environment is an error. Otherwise, the same for all steps of
-                an episode, it is an entry in ``failures`` and keeps its last numbers while the others go on;
-                :meth:`reset` restores it.
-            idle: Which sub-environments are over and about to be reset, shape [batch]; their numbers mean
-                nothing.
+            strict: Whether divergence of a sub-environment is an error. Otherwise it is listed in
+                ``failures`` and keeps its last values while the others continue, until :meth:`reset`. The
+                value must not change within an episode.
+            idle: Mask of ended sub-environments that will be reset, shape [batch]; their values are
+                meaningless.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            gymnasium.error.ResetNeeded: If no episode has been started, or one is over.
-            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
+            gymnasium.error.ResetNeeded: If no episode has been started, or an episode has ended.
+            plab.sim.SimulationError: If a simulation diverges and ``strict`` is True.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         simulator, steps = self._simulator, self._taken(idle=idle)
-        # The measures report faults, too: checking here would wait for the device twice.
+        # The measures report divergence, too; checking here would wait for the device twice.
         simulator.step(actions, check=False)
         self._steps = steps + 1
         # Queued before the wait for the measures.
@@ -509,7 +509,7 @@ class EpisodeBatch:
         except SimulationError as error:
             if strict:
                 raise
-            # Raised once a step: the second call returns the measures of the others.
+            # Raised once per step; the second call returns the measures of the others.
             self._failures, measured = error.failures | self._failures, self._measured(actions)
         before, self._last = self._last, (observation, *measured)
         self._keep(before, list(self._failures))
@@ -528,8 +528,8 @@ class EpisodeBatch:
         return done
 
     def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
-        """Let environments that have reached their stage's target go on to the next, where a step has ended;
-        returns the rewards."""
+        """Advance environments that have reached their stage's target to the next stage; return the
+        rewards."""
         reward = reward + Constants(stages.earned.copy()).like(like)
         stages.note(_on_host(info["score"]))
         reached = _on_host(info["score"]) >= self._success_score
@@ -555,7 +555,8 @@ class EpisodeBatch:
 
     @_alone
     def get_state(self) -> EpisodeState:
-        """Return a copy of the state, from which :meth:`set_state` continues: on the CPU with the same bits.
+        """Return a copy of the state for :meth:`set_state`; on the CPU the continuation is bitwise
+        reproducible.
 
         Raises:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
@@ -580,7 +581,7 @@ class EpisodeBatch:
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Replace the state by one that :meth:`get_state` of a batch of the same kind has returned.
+        """Restore a state returned by :meth:`get_state` of a batch of the same kind.
 
         Returns:
             Observations and ``info`` of the state, as :meth:`reset` returns them.
@@ -629,7 +630,7 @@ class EpisodeBatch:
                 observation before step t through these actions (for T: of a function of the last
                 observation), or None.
             discount: Discount factor: the loss of step t is weighted by ``discount ** t``.
-            like: Given a CUDA tensor, everything is one too.
+            like: If a CUDA tensor, all arrays are CUDA tensors.
 
         Returns:
             Unweighted loss terms after each step, shape [batch, T, term].
@@ -656,7 +657,8 @@ class EpisodeBatch:
         return terms
 
     def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
-        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if one has fewer left."""
+        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if an episode has fewer
+        remaining steps."""
         if self._steps is None:
             raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)
@@ -673,7 +675,7 @@ class EpisodeBatch:
         """
         simulator = self._simulator
         if not self._renderers:
-            # Imported here: drawing is not for everyone, and its library takes a second to load.
+            # Imported here, because rendering is optional and its library takes a second to load.
             from plab.render import Renderer
 
             for scene, mass in zip(self.problem.scenes, self.problem.target_mass, strict=True):
@@ -704,7 +706,7 @@ class EpisodeBatch:
         return observation if self._steps is None else self._noisy(observation, self._steps)
 
     def _noisy(self, observation: Any, steps: np.ndarray) -> Any:
-        """Add the noise that the environments have drawn to observations before a step."""
+        """Add the sampled noise to observations."""
         if not (deviations := self.draws.noise()).any():
             return observation
         rngs = [
@@ -743,7 +745,7 @@ class EpisodeBatch:
 
 
 class Restorable:
-    """Copies and pickles of an environment: its arguments and its state.
+    """Copying and pickling of environments by their arguments and state.
 
     Attributes:
         batch: The episodes.
@@ -768,8 +770,8 @@ class Restorable:
         self._np_random, self._np_random_seed = kept["random"]
 
     def _first_seeds(self, seed: int | Sequence[int] | None) -> Sequence[int] | None:
-        """Return the seeds of the sub-environments' draws, from ``np_random`` where none was ever given; None
-        if the draws go on."""
+        """Return the seeds of the sub-environments' randomisation, from ``np_random`` if none was given; None
+        to continue the random sequences."""
         count = self.batch.size
         if seed is None and not self._is_seeded:
             seed = [int(one) for one in self.np_random.integers(2**31, size=count)]  # type: ignore[attr-defined]
@@ -791,7 +793,7 @@ def _require_alike(cfgs: Sequence[Config]) -> None:
 
 
 def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
-    """Replace some rows of a table by those of another, both arrays or CUDA tensors."""
+    """Copy some rows between two tables, both arrays or CUDA tensors."""
     kept = before[rows]
     if on_device(table):
         kept = kept.to(table) if on_device(kept) else table.new_tensor(kept)

@@ -35,7 +35,7 @@ from plab.targets import RECIPES, TargetError, build_target
 from plab.targets.recipes import TensorRecipe
 
 FIRST_SCENE = 1000
-"""``seed_scene`` of the first of the scenes that ``task.randomize.scenes`` draws from."""
+"""``seed_scene`` of the first scene of ``task.randomize.scenes``."""
 
 Target = tuple[np.ndarray, np.ndarray]
 """Mass tensor of a target, and the distance to it."""
@@ -43,7 +43,7 @@ Target = tuple[np.ndarray, np.ndarray]
 
 @dataclass
 class _Base:
-    """A scene that values are put into: a sub-environment's own, or one of those that are drawn from."""
+    """A scene to be randomised: a sub-environment's own, or one of the random scenes."""
 
     cfg: Config
     scene: Scene
@@ -66,14 +66,14 @@ class EpisodeRandomizer:
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Check that scenes can be simulated over the whole ranges, and make those that are drawn from.
+        """Check that scenes can be simulated over the whole ranges, and build the random scenes.
 
         Args:
             cfgs: One configuration per sub-environment, :func:`~plab.config.draws.with_own_materials`.
             problem: Their scenes and targets.
 
         Raises:
-            plab.config.ConfigError: If a range does not do.
+            plab.config.ConfigError: If a range is invalid.
         """
         self._problem: Problem | None = problem
         self._cfgs = list(cfgs)
@@ -103,7 +103,7 @@ class EpisodeRandomizer:
         return any(self.values)
 
     def release(self) -> None:
-        """Let go of the simulator and its memory."""
+        """Release the simulator and its memory."""
         self._problem = None
 
     def noise(self) -> np.ndarray:
@@ -111,8 +111,7 @@ class EpisodeRandomizer:
         return np.array([float(values.get(NOISE, 0.0)) for values in self.values])
 
     def info(self) -> dict[str, np.ndarray]:
-        """Return the sampled values by dotted key, each of shape [batch, ...]; NaN where a sub-environment is
-        as configured."""
+        """Return the sampled values by dotted key, each of shape [batch, ...]; NaN without randomisation."""
         known = {key: value for values in self.values for key, value in values.items()}
         return {
             key: np.array([values.get(key, np.full(np.shape(like), np.nan)) for values in self.values])
@@ -133,13 +132,13 @@ class EpisodeRandomizer:
             Whether anything differs from the episodes before.
 
         Raises:
-            ValueError: If there is no such key, or a scene cannot be simulated with a value.
+            ValueError: If a key is unknown, or a scene cannot be simulated with a value.
         """
         drawn = {e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)}
         return self.put(drawn)
 
     def put(self, values: Mapping[int, Values]) -> bool:
-        """Give some sub-environments values; returns whether there are any."""
+        """Apply values to some sub-environments; return whether there are any."""
         values = {e: own for e, own in values.items() if own != self.values[e]}
         if not values:
             return False
@@ -197,7 +196,8 @@ class EpisodeRandomizer:
         return build_scene(cfg)
 
     def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
-        """Return the target of a scene: the recipe's if that need not be simulated, else that of its base."""
+        """Return the target of a scene: from the recipe if it is not simulated, otherwise from its base
+        scene."""
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
@@ -228,7 +228,7 @@ def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np
 
 
 def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
-    """Make the scenes and targets that a configuration's episodes draw from."""
+    """Build the random scenes and targets of a configuration's episodes."""
     count = int(cfg.task.randomize[SCENES])
     drawn = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
     # Errors of these scenes are raised when they are built.

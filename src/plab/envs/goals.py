@@ -1,4 +1,5 @@
-"""Goal-conditioned view of an environment, as of Gymnasium-Robotics' ``GoalEnv``, for hindsight replay."""
+"""Goal-conditioned wrapper of an environment, with the interface of Gymnasium-Robotics' ``GoalEnv``, for
+hindsight replay."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ _NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "targ
 class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray], np.ndarray]):
     """Environment with the observations ``observation``, ``achieved_goal`` and ``desired_goal``.
 
-    These are the state, where the mass is and where it is to be, in a coarse grid. Rewards are those of
-    :meth:`compute_reward`.
+    These are the state, and the current and the target mass distribution on a coarse grid. Rewards are
+    computed by :meth:`compute_reward`.
     """
 
     def __init__(self, env: gymnasium.Env[Any, np.ndarray]) -> None:
@@ -36,11 +37,11 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         self.observation_space = goals
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Return minus the share of the mass that is in the wrong cell, for one goal or many.
+        """Return minus the fraction of the mass in a wrong cell, for one goal or many.
 
         Args:
-            achieved_goal: Shares of the mass in each cell, shape [..., cell, cell, cell].
-            desired_goal: Those of the target, same shape.
+            achieved_goal: Fractions of the mass in each cell, shape [..., cell, cell, cell].
+            desired_goal: Fractions for the target, same shape.
             info: Ignored.
         """
         return -0.5 * np.abs(achieved_goal - desired_goal).sum(axis=(-3, -2, -1))

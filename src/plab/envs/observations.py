@@ -1,4 +1,4 @@
-"""Observations of environments: their entries, the spaces that hold them, and the derivatives by them."""
+"""Observations of environments: entries, spaces, and derivatives."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CELLS = 16
 """Cells per axis of ``mass`` and ``target_mass``."""
 
 DEFAULT_CAMERAS = {"front": Camera((0.5, 0.9, 1.7), (0.5, 0.15, 0.5), 45.0)}
-"""Cameras of environments that are given none."""
+"""Default cameras of environments."""
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
@@ -39,11 +39,11 @@ class Observer:
 
     Attributes:
         stride: Stride between observed particles.
-        constant: Last entries of an observation that do not change in an episode.
+        constant: Number of last entries of an observation that are constant in an episode.
     """
 
     def __init__(self, problem: Problem, cfg: Config) -> None:
-        """Choose the entries that a configuration asks for, and compute the constant ones."""
+        """Select the entries for a configuration, and compute the constant ones."""
         scene = problem.scenes[0]
         self.stride = _stride(scene, cfg.observe_particles)
         self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
@@ -54,15 +54,15 @@ class Observer:
 
     def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
         """Return observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses,
-        shape [batch, manipulator, 8]; ``dtype`` is that of an array."""
+        shape [batch, manipulator, 8]; ``dtype`` applies to arrays."""
         size = len(particles)
         rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
         rows.append(self._target.like(rows[0]))
         return _joined(rows, dtype)
 
     def pull_back(self, bar: Array) -> tuple[Array, Array]:
-        """Return the derivatives by particles, shape [batch, observed, 6], and poses, shape [batch,
-        manipulator, 8], from those by observations, shape [batch, entry]."""
+        """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
+        [batch, manipulator, 8], from those with respect to observations, shape [batch, entry]."""
         size, particles = len(bar), 6 * self._count
         whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
         # The entries after the poses are constant.
@@ -87,9 +87,9 @@ class SurfacePoints:
         self._spacing = (body.volume / body.particles) ** (1 / 3)
 
     def __call__(self, cameras: Sequence[CameraSensor], like: Array) -> Array:
-        """Return points of the current states, shape [batch, point, 3], float32, with a fourth entry if there
-        are cameras: 1 where one of them sees the point, else 0. Where the surface has fewer particles, others
-        follow them. A CUDA tensor if ``like`` is one."""
+        """Return points of the current states, shape [batch, point, 3], float32. With cameras, a fourth entry
+        is 1 for points visible to any of them, otherwise 0. If the surface has fewer particles, interior ones
+        are appended. A CUDA tensor if ``like`` is one."""
         import torch
 
         x = torch.as_tensor(self._simulator.observe(1, like)[..., :3]).float()
@@ -103,7 +103,7 @@ class SurfacePoints:
         for way in (1, nodes, nodes * nodes):
             for side in (-way, way):
                 inside &= occupied.gather(1, (flat + side).clamp(0, nodes**3 - 1))
-        # Particles of a body are in random order: the first ones are spread over its surface.
+        # Particles of a body are in random order, so the first ones are distributed over its surface.
         first = inside.byte().argsort(dim=1, stable=True)[:, : self._count]
         points = x.gather(1, first[..., None].expand(-1, -1, 3))
         if cameras:
@@ -112,7 +112,7 @@ class SurfacePoints:
         return points if on_device(like) else points.numpy()
 
     def _sees(self, sensor: CameraSensor, points: Any, like: Array) -> Any:
-        """Return which points, shape [batch, point, 3], nothing hides from a camera."""
+        """Return the visibility of points, shape [batch, point, 3], from a camera."""
         import torch
 
         camera = sensor.camera
@@ -130,11 +130,11 @@ class SurfacePoints:
 
 
 class Sensors:
-    """Observations by key: of the state, of particles, and pictures of cameras.
+    """Observations by key: state, particles, and camera pictures.
 
     Attributes:
         names: Names of the observations, out of :data:`OBSERVATIONS`.
-        space: Space of one environment's observation: that of the state or of a picture alone, or a Dict.
+        space: Space of one environment's observation: a Box for a single observation, or a Dict.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Sensors:
 
         Args:
             observe: One of :data:`OBSERVATIONS`, or several.
-            cameras: Cameras by name, or their attributes; :data:`DEFAULT_CAMERAS` if None and pictures are
+            cameras: Cameras by name, or their attributes; default: :data:`DEFAULT_CAMERAS` if pictures are
                 observed.
             simulator: Whose state is observed.
             state_space: Space of ``state``.
@@ -208,8 +208,8 @@ class Sensors:
             sensor.refresh()
 
     def __call__(self, state: Callable[[], Array], like: Array) -> Any:
-        """Return observations of the current states; ``state`` computes that of the same name. CUDA tensors
-        if ``like`` is one."""
+        """Return observations of the current states; ``state`` is the function for the observation of this
+        name. CUDA tensors if ``like`` is one."""
         out = {"state": state()} if "state" in self.names else {}
         if "particles" in self.names:
             x = cast(Simulator, self._simulator).observe(1, like)[..., :3]
@@ -245,13 +245,13 @@ class Sensors:
     def noisy(
         self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
     ) -> Any:
-        """Return observations with Gaussian noise, within their space; colours and labels have none.
+        """Return observations with Gaussian noise, within their space; colours and labels have no noise.
 
         Args:
             observation: Observations of a batch.
             deviations: Standard deviations, shape [batch].
-            rngs: Generators of the noise, one per environment: the same on every device and in every batch.
-            constant: Last entries of ``state`` that have none.
+            rngs: Generators of the noise, one per environment, independent of device and batch.
+            constant: Number of last entries of ``state`` without noise.
         """
 
         def one(name: str, values: Array, space: Box) -> Array:
@@ -268,7 +268,7 @@ class Sensors:
                 noise, low, high = (values.new_tensor(part) for part in (noise, low, high))
             seen = values + noise
             if name.endswith("depth"):
-                # Where nothing is seen, nothing is measured.
+                # The background has no noise.
                 seen = seen * (values < high) + values * (values >= high)
             return seen.clip(low, high)
 
@@ -279,7 +279,7 @@ class Sensors:
 
 
 def coarse_shares(mass: np.ndarray) -> np.ndarray:
-    """Return the share of a mass tensor, shape [n, n, n], in each of :data:`CELLS` cells per axis."""
+    """Return the fraction of a mass tensor, shape [n, n, n], in each of :data:`CELLS` cells per axis."""
     first = np.ceil(np.arange(CELLS) * len(mass) / CELLS).astype(int)
     for axis in range(3):
         mass = np.add.reduceat(mass, first, axis=axis)
@@ -287,7 +287,7 @@ def coarse_shares(mass: np.ndarray) -> np.ndarray:
 
 
 def _shares(x: Array) -> Array:
-    """Return the share of particles, shape [batch, particle, 3], in each cell, float32."""
+    """Return the fraction of particles, shape [batch, particle, 3], in each cell, float32."""
     device = on_device(x)
     cell = ((x * CELLS).long() if device else (x * CELLS).astype(np.int64)).clip(0, CELLS - 1)
     flat = (cell[..., 0] * CELLS + cell[..., 1]) * CELLS + cell[..., 2]
@@ -302,7 +302,7 @@ def _shares(x: Array) -> Array:
 
 
 def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
-    """Return points drawn from a mass tensor, always the same ones, shape [count, 3]."""
+    """Return points sampled from a mass tensor with a fixed seed, shape [count, 3]."""
     rng = np.random.default_rng(0)
     share = mass.clip(0.0).reshape(-1)
     nodes = rng.choice(share.size, count, p=share / share.sum())
@@ -311,7 +311,7 @@ def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
 
 
 def mapped(function: Callable[..., Any], *observations: Any) -> Any:
-    """Apply a function to observations, key by key where they are by key."""
+    """Apply a function to observations, or to each entry of a dictionary."""
     if not isinstance(observations[0], Mapping):
         return function(*observations)
     return {key: function(*(one[key] for one in observations)) for key in observations[0]}
@@ -319,7 +319,7 @@ def mapped(function: Callable[..., Any], *observations: Any) -> Any:
 
 def _joined(rows: Sequence[Array], dtype: type) -> Array:
     if on_device(rows[0]):
-        # The caller's tensor means that torch is imported already.
+        # A tensor implies that torch has been imported.
         import torch
 
         return torch.cat(list(rows), dim=1)
@@ -341,8 +341,7 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return the indices of the observed ones of the manipulators' 8 numbers: the gap only of those that
-    grip."""
+    """Return the indices of the observed numbers among the manipulators' 8: the gap only for grippers."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.kind.grips for m in scene.manipulators]
     return np.flatnonzero(observed)
@@ -361,7 +360,7 @@ def _target_observations(problem: Problem) -> np.ndarray:
     found: dict[bytes, np.ndarray] = {}
     rows = []
     for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
-        # A batch may have each target many times.
+        # Targets may repeat within a batch.
         key = b"".join(mass.tobytes() for mass in masses)
         if key not in found:
             found[key] = target_observation(*masses)
@@ -370,10 +369,10 @@ def _target_observations(problem: Problem) -> np.ndarray:
 
 
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
-    """Return the spaces of observations, with the entries that a configuration asks for, and of actions; each
-    holds those of all scenes."""
+    """Return the spaces of observations, with the entries of a configuration, and of actions; they cover all
+    scenes."""
     observed = _count(scenes[0], cfg.observe_particles)
-    # A faster particle crosses the domain in one substep, which is a SimulationError.
+    # Faster particles cross the domain in one substep, which is a SimulationError.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]

@@ -21,7 +21,7 @@ __all__ = ["PlabVecEnv", "make_sb3"]
 
 
 def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> PlabVecEnv:
-    """Make the environments of a registered id.
+    """Create the environments of a registered id.
 
     Args:
         env_id: Such as ``plab/Rope-v1``.
@@ -45,14 +45,14 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
 
 
 class PlabVecEnv(VecEnv):
-    """Sub-environments that one simulator advances together, each reset in the step that ends its episode.
+    """Sub-environments simulated as one batch, each reset in the last step of its episode.
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if any.
         together: Whether all episodes end together: a diverged episode is then frozen until the end, with the
             reason as ``failure`` in its infos. Otherwise it is truncated and reset immediately.
-        next_episode: Number of the episodes that the next :meth:`reset` starts; that after the last if None.
+        next_episode: Number of the episodes started by the next :meth:`reset`; default: the following one.
     """
 
     together = False
@@ -61,7 +61,7 @@ class PlabVecEnv(VecEnv):
     def __init__(
         self, batch: EpisodeBatch, *, render_mode: str | None = None, spec: EnvSpec | None = None
     ) -> None:
-        """Take over a batch of episodes.
+        """Wrap a batch of episodes.
 
         Args:
             batch: The episodes; closed with the environment.
@@ -134,7 +134,7 @@ class PlabVecEnv(VecEnv):
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute once per sub-environment: they have all in common.
+        """Return an attribute, repeated for each sub-environment, because they share all attributes.
 
         Raises:
             AttributeError: If there is no such attribute.
@@ -145,7 +145,7 @@ class PlabVecEnv(VecEnv):
         """Set an attribute of all sub-environments.
 
         Raises:
-            ValueError: If it is to be set for some only.
+            ValueError: If it is set for some sub-environments only.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
@@ -164,7 +164,7 @@ class PlabVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for every sub-environment: there is nothing to wrap."""
+        """Return False for every sub-environment, because there are no wrappers."""
         return [False for _ in self._get_indices(indices)]
 
     def _split(self, info: Mapping[str, Any], failures: Mapping[int, str]) -> list[dict[str, Any]]:

@@ -44,7 +44,7 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
                 ``render_target``.
 
         Raises:
-            ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
+            ValueError: If an argument is invalid; see also :class:`plab.envs.core.EpisodeBatch`.
         """
         self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}
         self.render_mode = check_render_mode(render_mode)
@@ -104,7 +104,7 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
         return _first(done.observation), float(done.reward[0]), *ends, info_of(done.info, 0, done.failures)
 
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Replace the state by one of :meth:`get_state`; returns its observation and ``info``."""
+        """Restore a state from :meth:`get_state`; return its observation and ``info``."""
         observation, info = self.batch.set_state(state)
         return _first(observation), info_of(info, 0, state.failures)
 

@@ -1,4 +1,4 @@
-"""Stages of an episode: targets that are to be reached one after the other."""
+"""Stages of an episode: a sequence of targets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def staged(cfg: Config) -> bool:
     """Return True if the task has stages before its target.
 
     Raises:
-        plab.config.ConfigError: If targets are drawn as well.
+        plab.config.ConfigError: If targets are randomised, too.
     """
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
         raise ConfigError("task.randomize cannot draw scenes or targets of a task with task.stages")
@@ -30,12 +30,12 @@ class Stages:
 
     Attributes:
         current: Number of each sub-environment's stage, shape [batch].
-        earned: Rewards at the ends of the stages before it, summed, shape [batch].
-        scores: Score reached in each stage, shape [batch, stage]; 0 in those to come.
+        earned: Sum of the rewards of completed stages, shape [batch].
+        scores: Score of each stage, shape [batch, stage]; 0 for later ones.
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Build the targets; ``problem`` has those of the last stage.
+        """Build the targets; ``problem`` has the targets of the last stage.
 
         Raises:
             plab.config.ConfigError: If the sub-environments differ in the number of stages.
@@ -60,14 +60,14 @@ class Stages:
         return self.current == len(self._targets) - 1
 
     def enter(self, stages: np.ndarray, problem: Problem) -> None:
-        """Give all sub-environments the targets of their stages, shape [batch]."""
+        """Set the targets of all sub-environments to those of their stages, shape [batch]."""
         rows = np.flatnonzero(stages != self.current)
         if rows.size:
             problem.vary(problem.scenes, {}, {int(e): self._targets[stages[e]][e] for e in rows})
         self.current = stages
 
     def begin(self, rows: Sequence[int], problem: Problem) -> bool:
-        """Return to the first stage in some sub-environments; returns whether one was in another."""
+        """Reset some sub-environments to the first stage; return whether any was in another."""
         stages, rows = self.current.copy(), list(rows)
         stages[rows], self.earned[rows], self.scores[rows] = 0, 0.0, 0.0
         changed = bool((stages != self.current).any())
@@ -75,7 +75,7 @@ class Stages:
         return changed
 
     def saved(self) -> tuple[np.ndarray, ...]:
-        """Return a copy of all that changes in an episode, for :meth:`restore`."""
+        """Return a copy of the episode's state, for :meth:`restore`."""
         return self.current.copy(), self.earned.copy(), self.scores.copy()
 
     def restore(self, saved: tuple[np.ndarray, ...], problem: Problem) -> None:
@@ -84,5 +84,5 @@ class Stages:
         self.enter(current, problem)
 
     def note(self, score: np.ndarray) -> None:
-        """Note the scores of the current stages, shape [batch]."""
+        """Record the scores of the current stages, shape [batch]."""
         self.scores[np.arange(len(score)), self.current] = score

@@ -1,4 +1,4 @@
-"""Batch of episodes with tensors in and out, for your own loops in PyTorch."""
+"""Batch of episodes with tensors as inputs and outputs, for custom PyTorch training loops."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
 
 
 class TensorEnv:
-    """A batch of episodes with tensors in and out.
+    """A batch of episodes with tensors as inputs and outputs.
 
-    On CUDA the tensors are on the simulator's device, and nothing but the actions' check and the simulator's
-    fault flags passes through the host.
+    On CUDA the tensors are on the simulator's device; only the check of actions and the divergence flags pass
+    through the host.
 
     Attributes:
-        batch: The environments; spaces, horizon and problem are theirs.
+        batch: The environments, with spaces, horizon and problem.
         device: Where the tensors are.
     """
 
@@ -43,7 +43,7 @@ class TensorEnv:
         self._like = torch.empty(0, device=self.device)
 
     def reset(self, **how: Any) -> Any:
-        """Start episodes; returns observations, shape [batch, entry], or by key. Arguments are those of
+        """Start episodes; return observations, shape [batch, entry], or by key. Arguments are those of
         :meth:`plab.envs.core.EpisodeBatch.reset`."""
         observation, _info = self.batch.reset(self._like, **how)
         return mapped(torch.as_tensor, observation)
@@ -57,12 +57,12 @@ class TensorEnv:
                 :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
-            Tensors; observations are float32, the others have the type of the actions, or the simulator's
-            precision if those are integers. ``terminated``, ``truncated`` and sampled parameters are arrays.
+            Tensors; observations are float32, all others have the type of the actions, or the simulator's
+            precision for integer actions. ``terminated``, ``truncated`` and sampled parameters are arrays.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
+            gymnasium.error.ResetNeeded: If no episode has been started, or it has ended.
             plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
         actions = floating(actions.detach().to(self.device), self.batch.problem.simulator)

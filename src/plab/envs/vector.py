@@ -20,10 +20,10 @@ __all__ = ["PlabVectorEnv"]
 
 
 class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
-    """Sub-environments that one simulator advances together.
+    """Sub-environments simulated as one batch.
 
-    Episodes end as those of :class:`plab.envs.single.PlabEnv` do, each for itself.
-    ``metadata["autoreset_mode"]`` determines when they are reset.
+    Episodes end individually, as in :class:`plab.envs.single.PlabEnv`. ``metadata["autoreset_mode"]``
+    determines when they are reset.
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
@@ -52,7 +52,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             render_mode: ``rgb_array``, or None for no pictures.
             autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``SameStep`` resets in the
                 last step of an episode, with the final observation in ``infos["final_obs"]``; ``NextStep`` in
-                the next step, which ignores the action; ``Disabled`` leaves it to :meth:`reset` with
+                the next step, which ignores the action; ``Disabled`` requires :meth:`reset` with
                 ``options={"reset_mask": ...}``.
             **options: Arguments of :func:`plab.envs.core.make_batch` and
                 :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and
@@ -117,7 +117,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: If the shape is wrong or an entry is not finite.
-            gymnasium.error.ResetNeeded: If an episode is over, and no other is to be started.
+            gymnasium.error.ResetNeeded: If an episode has ended and is not reset automatically.
         """
         idle = self.batch.over if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, bool)
         if idle.all():
@@ -143,7 +143,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         return observation, reward, terminated, truncated, info
 
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Replace the state by one of :meth:`get_state`; returns its observations and ``info``."""
+        """Restore a state from :meth:`get_state`; return its observations and ``info``."""
         observation, info = self.batch.set_state(state)
         return observation, self._masked(info | self._failures(state.failures))
 
@@ -160,7 +160,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         self.batch.close()
 
     def _restarted(self, mask: np.ndarray, **how: Any) -> tuple[Any, dict[str, Any]]:
-        """Start the next episodes of some sub-environments; returns observations and ``info`` of all."""
+        """Start the next episodes of some sub-environments; return observations and ``info`` of all."""
         observation, info = self.batch.reset(environments=None if mask.all() else np.flatnonzero(mask), **how)
         return observation, self._masked(info)
 

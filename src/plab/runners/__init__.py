@@ -1,7 +1,7 @@
 """Runners: one per family of methods; each turns configurations into result files.
 
-A method's file has the dataclass of its keys, its runner and its record, which the registry
-:data:`plab.config.families.FAMILIES` finds. Runs are carried out in batches; a single run is a batch of one.
+The file of a method contains the dataclass of its keys, its runner and its record, registered in
+:data:`plab.config.families.FAMILIES`. Runs are executed in batches; a single run is a batch of one.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ __all__ = [
 
 
 def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
-    """Run one configuration, unless its result is there already.
+    """Run one configuration, unless its result exists.
 
     Args:
         cfg: The composed and checked configuration.
         cache: Simulators of earlier runs; None: a new one.
 
     Returns:
-        The run's score in [0, 1], as its protocol counts it.
+        The run's score under its protocol, in [0, 1].
 
     Raises:
         ResultsError: If the results folder cannot be written, or another process computes the run.
@@ -61,7 +61,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
 def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
     """Run configurations that fit together; see :func:`plab.sweep.running.plan`.
 
-    Runs that have finished before, or that another process computes, are left out.
+    Finished runs, and runs in progress in another process, are skipped.
 
     Args:
         cfgs: The composed and checked configurations.
@@ -69,7 +69,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
         cache: Simulators of earlier batches; None: a new one.
 
     Returns:
-        End of each run, in the order of ``cfgs``.
+        Outcome of each run, in the order of ``cfgs``.
     """
     ended: list[Outcome | Track] = []
     for cfg in cfgs:
@@ -81,7 +81,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
     todo = [one for one in ended if isinstance(one, Track) and not one.finished_before]
     _execute_batch(todo, note, cache or SimulatorCache())
     if traceback_wanted():
-        # Once if it ended several runs.
+        # Only once if it ended several runs.
         for error in {id(track.error): track.error for track in todo}.values():
             if error is not None and not isinstance(error, PlabError):
                 traceback.print_exception(error)
@@ -92,8 +92,8 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
 
 def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-    """Run tracks of one family to their ends; afterwards each has finished or has an error, and holds no
-    lock."""
+    """Execute tracks of one family; afterwards each has finished or has an error, and its lock is
+    released."""
     parties = [tracks] if tracks else []
     party: Sequence[Track] = ()
     try:
@@ -133,7 +133,7 @@ def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) ->
 
 
 def _groups(tracks: Sequence[Track], own: Family) -> list[Sequence[Track]]:
-    """Return groups of runs that can be carried out together: each alone, all, or those at the same
+    """Return groups of runs that can be executed together: each alone, all, or those at the same
     iteration."""
     if not own.batching:
         return [[track] for track in tracks]

@@ -1,4 +1,5 @@
-"""Training of one policy: networks, state and drawn scenes, as ``shac``, ``pods`` and ``bc`` have them."""
+"""Base of ``shac``, ``pods`` and ``bc``: training of one policy with its networks, state and random
+scenes."""
 
 from __future__ import annotations
 
@@ -33,16 +34,16 @@ DEVIATION_MIN = 0.01
 constant entries, scaled up, would dominate the gradient through the policy."""
 
 FIRST_SCENE = 1000
-"""``seed_scene`` of the first of the scenes that ``method.scenes`` asks for."""
+"""``seed_scene`` of the first scene of ``method.scenes``."""
 
 
 @dataclass
 class ActorConfig(PolicyConfig):
-    """Keys of the methods that train a policy by the simulator's gradient, in one scene or many.
+    """Keys of methods that train a policy with the simulator's gradient, in one scene or many.
 
     Attributes:
-        scenes: Scenes that the environments of the training are drawn from; 0: that of the run.
-        num_envs: Environments simulated together; where scenes are more, they are taken in turn.
+        scenes: Number of random training scenes; 0: the run's own scene.
+        num_envs: Number of environments simulated together; more scenes are used in turn.
     """
 
     scenes: int = field(metadata=ranges.NOT_NEGATIVE)
@@ -80,11 +81,11 @@ def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
 
 
 class ActorTraining(Training):
-    """A policy, its optimiser, and the episodes from which it learns.
+    """A policy, its optimiser, and its training episodes.
 
     Attributes:
         network: The policy.
-        statistics: Moments of the observations, by which they are scaled.
+        statistics: Moments of the observations, used for scaling.
         broken: Times and reasons of the episodes that diverged since the last evaluation.
     """
 
@@ -110,7 +111,7 @@ class ActorTraining(Training):
 
     @staticmethod
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
-        """Return the policy with which training begins, on the CPU."""
+        """Return the initial policy, on the CPU."""
         return actor_policy(spaces, method.hidden)
 
     @property
@@ -124,8 +125,7 @@ class ActorTraining(Training):
 
     @abstractmethod
     def learn(self, rate_left: float) -> None:
-        """Run a round of episodes, and learn from them; ``rate_left`` falls linearly from 1 to 0 over the
-        training."""
+        """Run a round of training episodes; ``rate_left`` falls linearly from 1 to 0 over the training."""
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(Policy(self.network, *self._moments)(observations.cpu().numpy()))
@@ -169,7 +169,7 @@ class ActorTraining(Training):
         return {"policy": self.network, "optimizer": self._optimizer}
 
     def state(self) -> dict[str, Any]:
-        """Return everything that the next episodes depend on, as tensors and numbers."""
+        """Return the full training state, as tensors and numbers."""
         moments = self.statistics.mean, self.statistics.var, self.statistics.count
         return {
             "steps": self.steps,
@@ -179,7 +179,7 @@ class ActorTraining(Training):
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; RuntimeError if it is that of other networks."""
+        """Return to a :meth:`state`; RuntimeError if it belongs to other networks."""
         for name, one in self.learners().items():
             one.load_state_dict(state[name])
         mean, var, count = state["statistics"]
@@ -190,10 +190,10 @@ class ActorTraining(Training):
 
 
 class ActorRunner(PolicyRunner):
-    """Base of the runners that train a policy by the gradient, in the run's scene or in drawn ones."""
+    """Base of runners that train a policy with the gradient, in the run's scene or in random scenes."""
 
     def require_torch_device(self) -> None:
-        """Raise ConfigError if torch does not have the device, or it is not the simulator's."""
+        """Raise ConfigError if the device is not available in torch, or differs from the simulator's."""
         super().require_torch_device()
         if self.method.torch_device != (device := self.tracks[0].cfg.sim.device):
             raise ConfigError(
@@ -206,8 +206,8 @@ class ActorRunner(PolicyRunner):
 
 
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:
-    """Return the configurations of a training's ``count`` environments in a turn: the run's own, or those of
-    the drawn scenes that follow the turn before and fit into the grid, repeated if they are fewer."""
+    """Return the configurations of ``count`` training environments in a round: the run's own, or the next
+    random scenes that fit into the grid, repeated if there are fewer."""
     from plab.config import drawn_configs
     from plab.problem import fits
 

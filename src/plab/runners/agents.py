@@ -1,8 +1,8 @@
-"""Agents that learn in step with each other, as ``sac``, ``td3`` and ``ppo`` have them: one or many at once.
+"""Base of ``sac``, ``td3`` and ``ppo``: one or many agents trained in lockstep.
 
-The agents share nothing but the launches: parameters are stacked, [agent, ...], and multiplied in batches.
-Each agent has its own environments, replay buffer, statistics and random numbers, starts with
-Stable-Baselines3's initial networks, and makes the same updates as Stable-Baselines3.
+Agents share only kernel launches: their parameters are stacked, [agent, ...], for batched products. Each
+agent has its own environments, replay buffer, statistics and random numbers, starts with Stable-Baselines3's
+initial networks, and makes the same updates as Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class RlConfig(PolicyConfig):
     """Keys of all reinforcement-learning methods.
 
     Attributes:
-        profile: Profile that gives the values that are not overridden; None: there are no profiles.
+        profile: Profile with the default values; None: there are no profiles.
         num_envs: Environments simulated together.
         gamma: Discount factor.
         profiles: Values by profile. Empty in the configuration of a run, whose fields have the values.
@@ -51,7 +51,7 @@ class RlConfig(PolicyConfig):
 
 @dataclass
 class OffPolicyConfig(RlConfig):
-    """Keys of the methods that learn from a replay buffer.
+    """Keys of off-policy methods, which use a replay buffer.
 
     Attributes:
         buffer_size: Transitions kept for replay.
@@ -78,7 +78,7 @@ class AgentRandom:
     """Independent random number generators of K agents on a device."""
 
     BLOCK = 50
-    """Entries that :meth:`block` draws at once."""
+    """Entries drawn at once by :meth:`block`."""
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
         """Seed a generator per agent."""
@@ -106,19 +106,19 @@ class AgentRandom:
         return self._per_agent(lambda g: torch.randperm(count, generator=g, device=self._device))
 
     def block(self, use: str, draw: Callable[..., Tensor], *shape: int) -> Tensor:
-        """Return the next entry, shape [agent, *shape], of a block for some use, which a method of this class
-        draws when the last one is used up."""
+        """Return the next entry, shape [agent, *shape], of a named block of random numbers, which is refilled
+        when used up."""
         if not self._rest.get(use):
             self._rest[use] = list(draw(self.BLOCK, *shape).unbind(1))[::-1]
         return self._rest[use].pop()
 
     def states(self) -> list[np.ndarray]:
-        """Return the state of each generator, and drop the blocks: a process that resumes has none."""
+        """Return the state of each generator, and drop the blocks, because a resumed process has none."""
         self._rest = {}
         return [generator.get_state().numpy() for generator in self._generators]
 
     def restore(self, agent: int, state: np.ndarray) -> None:
-        """Return an agent's generator to one of :meth:`states`."""
+        """Restore an agent's generator from one of :meth:`states`."""
         self._generators[agent].set_state(torch.from_numpy(np.array(state, np.uint8)))
 
 
@@ -136,7 +136,7 @@ class Sizes(NamedTuple):
 
     @property
     def entries(self) -> int:
-        """Numbers, all float32, of one episode in all N environments."""
+        """Number of float32 values of one episode in all N environments."""
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def window(self, buffer_size: int) -> int:
@@ -147,13 +147,13 @@ class Sizes(NamedTuple):
     def capacity(self, buffer_size: int, total_steps: int) -> int:
         """Return the number of episodes of N environments in a buffer, given the number of training
         transitions."""
-        # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
+        # One more, because the oldest samples may begin, and the latest end, within an episode.
         held = math.ceil(self.window(buffer_size) / self.horizon) + 1
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
 
 
 class Samples(NamedTuple):
-    """Transitions to learn from, each of shape [agent, row, ...]; rewards have no third axis."""
+    """Sampled transitions, each of shape [agent, row, ...]; rewards have no third axis."""
 
     observations: Tensor
     actions: Tensor
@@ -162,10 +162,10 @@ class Samples(NamedTuple):
 
 
 class ReplayBuffer:
-    """The transitions of K agents that stand at the same step; each observation is stored once.
+    """Transitions of K agents in lockstep; each observation is stored once.
 
     Attributes:
-        added: Steps of all N environments that were added, the overwritten ones included.
+        added: Number of steps of all N environments added so far, including overwritten ones.
     """
 
     def __init__(
@@ -181,11 +181,11 @@ class ReplayBuffer:
         self._observations = torch.empty((*shape, horizon + 1, n, sizes.observed), device=device)
         self._actions = torch.empty((*shape, horizon, n, sizes.actions), device=device)
         self._rewards = torch.empty((*shape, horizon, n), device=device)
-        # Where recorded updates find how much there is: first step that can be sampled, and how many can.
+        # Range of samples for captured updates: first step, and number of steps.
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._count = torch.ones((), dtype=torch.int64, device=device)
         self._agent = torch.arange(agents, device=device).unsqueeze(1)
-        # Episodes of N environments that each agent's file holds.
+        # Number of episodes of N environments in each agent's file.
         self._written = [0] * agents
 
     def add(self, observations: Tensor, actions: Tensor, rewards: Tensor, next_observations: Tensor) -> None:
@@ -206,12 +206,11 @@ class ReplayBuffer:
 
     @property
     def count(self) -> int:
-        """Steps of all N environments that can be sampled."""
+        """Number of steps of all N environments that can be sampled."""
         return min(self.added, self._window)
 
     def sample(self, numbers: Tensor) -> Samples:
-        """Take transitions, uniformly from those that can be sampled, by large random integers, shape
-        [agent, row]."""
+        """Sample transitions uniformly, given large random integers, shape [agent, row]."""
         n, horizon = self._sizes.envs, self._sizes.horizon
         env, steps = numbers % n, self._first + numbers // n % self._count
         episode = self._agent * self._capacity + steps // horizon % self._capacity
@@ -255,13 +254,13 @@ class ReplayBuffer:
                         numbers = np.fromfile(file, np.float32, part.numel())
                         part.copy_(torch.from_numpy(numbers).view(part.shape))
         except (OSError, RuntimeError) as error:
-            # Gone, or shorter than the checkpoint says.
+            # The file is missing or shorter than required by the checkpoint.
             raise ResultsError(
                 f"cannot read the replay buffer {path}: {error}; start afresh with force=true"
             ) from error
 
     def _parts(self, agent: int, episode: int) -> list[Tensor]:
-        """Return an episode's places in the buffers, in the order in which they are in the file."""
+        """Return an episode's places in the buffers, in file order."""
         tables = self._observations, self._actions, self._rewards
         return [table[agent, episode % self._capacity] for table in tables]
 
@@ -274,12 +273,12 @@ class Agents:
 
     Attributes:
         sizes: Sizes of their episodes.
-        steps: Transitions of each so far.
-        updates: Updates of each so far.
+        steps: Number of transitions per agent so far.
+        updates: Number of updates per agent so far.
         networks: Their parameters.
-        optimizers: Adam of parts of them, by name.
+        optimizers: Adam optimisers of parts of the networks, by name.
         tensors: Further tensors of a checkpoint, by name, each of shape [agent, ...].
-        watched: Losses are kept for :meth:`take_losses`.
+        watched: Whether losses are recorded for :meth:`take_losses`.
     """
 
     PARTS: ClassVar[Mapping[str, Sequence[str]]]
@@ -292,7 +291,7 @@ class Agents:
     watched = False
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks; all configurations, one per agent, have the same section
+        """Initialise untrained networks for configurations, one per agent, with the same section
         ``method``."""
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
@@ -310,7 +309,7 @@ class Agents:
     @staticmethod
     @abstractmethod
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
-        """Return Stable-Baselines3's policy with the first weights, on the CPU."""
+        """Return Stable-Baselines3's policy with initial weights, on the CPU."""
 
     def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
         """Return Stable-Baselines3's policy with an agent's networks, and by what its observations are
@@ -321,15 +320,15 @@ class Agents:
 
     @classmethod
     def cycle_steps(cls, method: Any, horizon: int) -> int:
-        """Return the transitions after which training can pause: a batch of episodes, or an update."""
+        """Return the number of transitions per training cycle: a batch of episodes, or an update."""
         return method.num_envs * horizon
 
     def begin(self, observations: Tensor) -> None:
-        """Take the observations with which the training begins, shape [agent, env, entry]."""
+        """Set the initial observations of the training, shape [agent, env, entry]."""
 
     @abstractmethod
     def act(self, observations: Tensor) -> Tensor:
-        """Return actions to learn from, shape [agent, env, action], for observations, shape [agent, env,
+        """Return exploratory actions, shape [agent, env, action], for observations, shape [agent, env,
         entry]."""
 
     @abstractmethod
@@ -338,9 +337,9 @@ class Agents:
 
     @abstractmethod
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
-        """Take the results of the latest actions, rewards, shape [agent, env], and the observations after it,
-        shape [agent, env, entry]; make the updates that are due. The next step starts from
-        ``observations``, which are the last ones unless the episodes are ``over``."""
+        """Process the results of the latest actions: rewards, shape [agent, env], and next observations,
+        shape [agent, env, entry]; make the updates that are due. The next step starts from ``observations``,
+        which differ from the last ones if the episodes are ``over``."""
 
     def _tables(self) -> dict[str, list[Tensor]]:
         """Return the stacked tensors with one row per agent, by their names in an agent's state."""
@@ -353,7 +352,7 @@ class Agents:
         return tables
 
     def states(self) -> list[dict[str, Any]]:
-        """Return each agent's state: all that further training depends on, except a replay buffer."""
+        """Return the full training state of each agent, except its replay buffer."""
         rows = {name: flat(tensors, self.count).cpu().numpy() for name, tensors in self._tables().items()}
         shared = {"steps": self.steps, "updates": self.updates}
         for name, optimizer in self.optimizers.items():
@@ -364,8 +363,8 @@ class Agents:
         ]
 
     def restore(self, agent: int, state: Mapping[str, Any]) -> None:
-        """Return an agent to one of :meth:`states`; the others have to be returned to the same step. Raise
-        RuntimeError if it is another agent's."""
+        """Restore an agent from one of :meth:`states`; the others must be restored to the same step. Raise
+        RuntimeError if it belongs to another agent."""
         for name, tensors in self._tables().items():
             fill(tensors, self.count, agent, torch.from_numpy(state[name]))
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
@@ -403,14 +402,14 @@ class OffPolicyAgents(Agents):
 
     @abstractmethod
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Return the policy's actions with noise, which is standard normal and of their shape."""
+        """Return the policy's actions with noise, given standard normal numbers of the same shape."""
 
     @abstractmethod
     def update(self) -> None:
         """Make one update."""
 
     def act(self, observations: Tensor) -> Tensor:
-        """Return random actions at first, then those of the policy with noise."""
+        """Return random actions initially, and later those of the policy with noise."""
         self._observations = observations
         if self.steps < self.method.learning_starts:
             shape = self.sizes.envs, self.sizes.actions
@@ -428,11 +427,11 @@ class OffPolicyAgents(Agents):
         return self.draws.block("numbers", self.draws.integers, self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
-        """Return the actions before learning starts, given uniformly random ones."""
+        """Return the actions used before learning starts, given uniformly random ones."""
         return actions
 
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
-        """Keep the transitions, and make an update for each, or as many as ``gradient_steps`` says."""
+        """Store the transitions, and make one update per transition, or ``gradient_steps`` updates."""
         self.replay.add(self._observations, self._actions, rewards, last)
         self.steps += self.sizes.envs
         if self.steps > self.method.learning_starts:

@@ -1,7 +1,7 @@
 """A policy network trained through the simulator's gradient: ``apg``, analytic policy gradient.
 
-Each iteration runs an episode of the policy, and goes back through its states, observations and actions. To
-reproduce a result:
+Each iteration simulates an episode of the policy, and backpropagates through its states, observations and
+actions. To reproduce a result:
 
     python -m plab.run task=Move variant=1 method=apg seed=0
 """
@@ -41,7 +41,7 @@ class ApgConfig(MethodConfig):
 
 
 class ApgRunner(Runner):
-    """Runner of a policy network; each iteration is an episode of it, with gradient."""
+    """Runner of a policy network; each iteration is an episode with gradient."""
 
     @property
     def method(self) -> ApgConfig:
@@ -57,7 +57,8 @@ class ApgRunner(Runner):
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make network and optimiser, with torch's own initial weights, or take those of the file."""
+        """Create network and optimiser, with torch's default initial weights, or restore them from the
+        file."""
         entries, action_dim = Spaces.of(self._episode).sizes
         widths, layers = [entries, *self.method.hidden], list[torch.nn.Module]()
         with torch.random.fork_rng(devices=[]):
@@ -73,7 +74,7 @@ class ApgRunner(Runner):
             self._optimizer.load_state_dict(known["optimizer"])
 
     def step(self, track: Track) -> Step:
-        """Run an episode of the policy, and improve the policy by the gradient of its loss."""
+        """Simulate an episode, and update the policy with the gradient of its loss."""
         from plab.envs.autograd import policy_gradient
 
         episode, problem = self._episode, self.problem

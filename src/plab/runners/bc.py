@@ -1,6 +1,6 @@
 """Behaviour cloning: ``bc``, a policy that learns the actions of a dataset from its observations.
 
-``plab dataset`` writes datasets, and so does minari. To reproduce a result:
+Datasets are written by ``plab dataset`` or Minari. To reproduce a result:
 
     plab dataset task=Torus variant=random 'seed_scene=range(1000,1400)' observe_target=true
     plab run task=Torus variant=random seed_scene=9000 method=bc observe_target=true
@@ -34,7 +34,7 @@ class BcConfig(PolicyConfig):
     Attributes:
         dataset: Folder of a dataset of this task, with the same observation.
         demonstrations: Maximum number of episodes of the dataset to learn from; None: all.
-        episodes: Episodes to learn from, each pass over the dataset counted; rounded up to whole passes.
+        episodes: Training episodes in total, counting each pass over the dataset; rounded up to whole passes.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations, in units of theirs.
         shift: Largest common shift of all observed positions along x and along z [domain units].
@@ -48,7 +48,8 @@ class BcConfig(PolicyConfig):
 
 
 class Imitation(ActorTraining):
-    """A policy that learns given actions by their mean squared error, with observations augmented."""
+    """A policy trained by supervised learning of actions (mean squared error), with augmented
+    observations."""
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
@@ -58,8 +59,8 @@ class Imitation(ActorTraining):
         self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfgs[0]), device=self._device)
 
     def imitate(self, seen: torch.Tensor, wanted: torch.Tensor, count: int) -> float:
-        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry], by
-        ``count`` minibatches; return the mean of their errors."""
+        """Train the policy on actions, shape [row, A], for scaled observations, shape [row, entry], with
+        ``count`` minibatches; return the mean error."""
         method, drawn = self._method, dict[str, Any](generator=self._generator, device=self._device)
         minibatches: list[torch.Tensor] = []
         errors: list[torch.Tensor] = []
@@ -79,7 +80,7 @@ class Imitation(ActorTraining):
 
 
 class Cloning(Imitation):
-    """A policy that learns from a dataset; a cycle is a pass over it."""
+    """A policy trained on a dataset; a cycle is one pass."""
 
     columns = ("imitation_error",)
 
@@ -101,17 +102,18 @@ class Cloning(Imitation):
         self.report()
 
     def learn(self, rate_left: float) -> None:
-        """Pass over the data once, at a share of the learning rate."""
+        """Make one pass over the data, at a fraction of the learning rate."""
         set_rate(self._optimizer, self._method.lr * rate_left)
         count = math.ceil(len(self._seen) / self._method.batch_size)
         self.note(imitation_error=np.array([self.imitate(self._seen, self._wanted, count)]))
 
 
 class BcRunner(PolicyRunner):
-    """Trains a policy; each iteration is some passes over the data, then one episode of the policy."""
+    """Runner of behaviour cloning; each iteration consists of some passes over the data and one evaluation
+    episode."""
 
     def build(self) -> None:
-        """Read the dataset, and make the environment that judges."""
+        """Read the dataset, and create the evaluation environment."""
         from plab.envs.tensors import TensorEnv
 
         self.require_torch_device()
@@ -124,7 +126,7 @@ class BcRunner(PolicyRunner):
             track.run.result.provenance["dataset_rows"] = len(data[0])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Pass over the data until the next evaluation is due; only that simulates anything."""
+        """Train until the next evaluation is due; only evaluations use the simulator."""
         for track, step in super().iterate(tracks):
             yield track, replace(step, steps_forward=len(step.actions), steps_gradient=0)
 
@@ -133,7 +135,7 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
     """Return observations, shape [row, entry], and actions, shape [row, A], of a dataset, float32.
 
     Raises:
-        plab.config.ConfigError: If observations or actions are not those of the spaces.
+        plab.config.ConfigError: If observations or actions do not fit the spaces.
     """
     from plab.demonstrations.minari import read_episodes
 

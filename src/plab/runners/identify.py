@@ -1,9 +1,9 @@
 """System identification: ``identify`` fits material, friction and gravity to observed particles.
 
 Gauss-Newton method with Levenberg's damping on the particle positions of an episode of a dataset. Derivatives
-are central differences, with all simulations in one batch. The standard deviations are those of Laplace's
-approximation, with the noise that the residuals show. The configuration has the first guess. To reproduce a
-result:
+are central differences, with all simulations in one batch. The standard deviations are from Laplace's
+approximation, with the noise estimated from the residuals. The configuration provides the initial guess. To
+reproduce a result:
 
     plab dataset task=Torus variant=1
     plab run task=Torus method=identify task.yield_stress=100 seed=0
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from plab.scenes import Scene
 
 PARAMETERS = ("youngs_modulus", "poisson_ratio", "yield_stress", "floor_friction", "gravity")
-"""Parameters that can be fitted; of gravity the acceleration downwards."""
+"""Parameters that can be fitted; for gravity, the downward acceleration."""
 
 HIGHEST_POISSON_RATIO = 0.49
 
@@ -40,9 +40,9 @@ class IdentifyConfig(MethodConfig):
         dataset: Folder of a dataset of this task and variant; the observation is ``state`` or ``particles``.
         episode: Number of its episode that is fitted.
         parameters: Fitted parameters, out of :data:`PARAMETERS`; the others are the task's.
-        iterations: Simulations of all parameters' changes, hence steps.
+        iterations: Number of Gauss-Newton steps.
         difference: Relative change of a parameter for central differences.
-        damping: First damping, relative to the curvature.
+        damping: Initial damping, relative to the curvature.
     """
 
     dataset: str
@@ -61,10 +61,11 @@ class IdentifyConfig(MethodConfig):
 
 
 class IdentifyRunner(Runner):
-    """Fits parameters; each iteration is a batch of simulations, and a step if the last one was good.
+    """Runner of system identification; each iteration is a batch of simulations, and a step if the trial
+    improved the fit.
 
-    A row has the best parameters so far, their standard deviations, and the root mean square distance of the
-    particles from where they were observed. Actions and scores are those of the episode.
+    A row has the best parameters so far, their standard deviations, and the RMS distance of the particles
+    from their observed positions. Actions and scores are the episode's.
     """
 
     def build(self) -> None:
@@ -97,7 +98,7 @@ class IdentifyRunner(Runner):
         self._observed = rows[1:, :, :3].astype(np.float64)
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Begin with the configuration's parameters, or go on from the file's."""
+        """Start from the configuration's parameters, or resume from the file."""
         first = [_value(self.problem.scenes[0], name) for name in self._method.parameters]
         if min(first) <= 0.0:
             raise ConfigError("parameters that are fitted must be positive at first")
@@ -109,7 +110,7 @@ class IdentifyRunner(Runner):
             self._state = {name: np.array(value) for name, value in state.items()}
 
     def step(self, track: Track) -> Step:
-        """Simulate the trial and its changes, take it if it fits better, and make the next one."""
+        """Simulate the trial and its perturbations, accept it if it fits better, and compute the next one."""
         begin, method, state = time.perf_counter(), self._method, self._state
         changes = np.eye(len(method.parameters)) * method.difference
         trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
@@ -125,7 +126,7 @@ class IdentifyRunner(Runner):
             state |= {"damping": max(4.0 * state["damping"], 1e-6)}
         damped = state["curvature"] + state["damping"] * np.diag(np.diag(state["curvature"]))
         way = np.linalg.lstsq(damped, -state["slope"], rcond=None)[0]
-        # No parameter changes by more than a factor of 2 at once.
+        # A step changes parameters by at most a factor of 2.
         state["trial"] = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
         variance = state["cost"] / max(residual.size - len(changes), 1)
         deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
@@ -137,7 +138,7 @@ class IdentifyRunner(Runner):
         return Step(measured | found, self._actions, dict(state), steps_forward=steps, seconds=seconds)
 
     def close(self) -> None:
-        """Return to the configuration's scene."""
+        """Restore the configuration's scene."""
         if hasattr(self, "problem"):
             self.problem.simulator.set_scenes(self.problem.scenes)
 

@@ -1,7 +1,7 @@
 """Model-predictive control: ``mpc`` plans some steps ahead, takes the first of them, and plans again.
 
-Any planner or gradient method plans, from the state that has been reached; the section ``method.planner`` has
-its keys. The next plan starts from the rest of the last. To reproduce a result:
+Any planner or gradient method can plan from the current state; its keys are in the section
+``method.planner``. Each plan is initialised with the remainder of the previous one. To reproduce a result:
 
     plab run task=Move variant=1 method=mpc seed=0
     plab run task=Move variant=1 method=mpc method@method.planner=adam seed=0
@@ -65,7 +65,7 @@ class MpcConfig(MethodConfig):
 
     @property
     def population(self) -> int:
-        """Candidates that are tried together."""
+        """Number of candidates simulated together."""
         return getattr(self.planner, "population", 1)
 
 
@@ -75,7 +75,7 @@ class GradientPlanner(Planner):
     method: Any
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Start from the best that has been found, or from random actions."""
+        """Start from the best actions so far, or from random ones."""
         seed = int(torch.randint(2**31, (1,), generator=random, device=self.start.device))
         kind = family(self.method.family).rules[self.method.optimizer].what
         self._rule = kind(self.method, self.start.shape, seed)
@@ -99,7 +99,7 @@ class GradientPlanner(Planner):
 
 
 class Replanning(CandidateStart):
-    """Random starts in the middle of an episode: those that go to the body are for its beginning."""
+    """Random starts during an episode, because contact starts only apply at its beginning."""
 
     def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
         """Draw candidates, shape [count, T, A]."""
@@ -107,9 +107,10 @@ class Replanning(CandidateStart):
 
 
 class MpcRunner(PlannerRunner):
-    """Plans and executes; each iteration is a plan of the steps ahead and the execution of some of them.
+    """Runner of model-predictive control; each iteration plans and executes some steps.
 
-    A row measures the steps taken so far; only the last, of a whole episode, can have the best actions.
+    A row evaluates the steps executed so far; only the last row, of the whole episode, can have the best
+    actions.
     """
 
     def build(self) -> None:
@@ -120,7 +121,7 @@ class MpcRunner(PlannerRunner):
         self._method = self._track.cfg.method_as(MpcConfig)
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Begin the episode, or take the steps of the file again."""
+        """Begin the episode, or repeat the steps in the file."""
         self._executed = np.zeros((0, self.problem.scenes[0].action_dim))
         self._found: Tensor | None = None
         self._terms: list[np.ndarray] = []
@@ -132,14 +133,14 @@ class MpcRunner(PlannerRunner):
                 self._found = torch.as_tensor(np.array(state["found"]), device=self._device)
 
     def iterations(self, track: Track) -> int:
-        """Return how many plans an episode takes."""
+        """Return the number of plans per episode."""
         return math.ceil(track.cfg.sim.horizon / self._method.execute)
 
     def has_more(self, track: Track) -> bool:
         return track.iteration < self.iterations(track)
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Plan from here, and take the first steps of the plan."""
+        """Plan from the current state, and execute the first steps."""
         begin, track, method = time.perf_counter(), self._track, self._method
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)
@@ -163,7 +164,7 @@ class MpcRunner(PlannerRunner):
         plans = planner.found()
         share = plans[0, : method.execute].cpu().numpy()
         self._execute(share)
-        # The rest of each plan, and its last action on and on.
+        # The remainder of each plan, extended by its last action.
         left = plans[:, len(share) :] if plans.shape[1] > len(share) else plans[:, -1:]
         last = left[:, -1:].expand(-1, method.window - left.shape[1], -1)
         self._found = torch.cat([left, last], dim=1)
@@ -183,23 +184,23 @@ class MpcRunner(PlannerRunner):
         yield track, step
 
     def close(self) -> None:
-        """Return to the beginning, from which the episode is judged."""
+        """Return to the initial state for the evaluation."""
         if hasattr(self, "_beginning"):
             self._go_to(self._beginning)
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report how the episode goes."""
+        """Report the progress of the episode."""
         text = f"step {len(self._executed)} hard score {rows[0]['score']:.3f}"
         self.report(self._track.iteration, text)
 
     def _numbers(self, number: int) -> torch.Generator:
-        """Return the random numbers of an iteration of the plan, which a resumed run draws again."""
+        """Return the random generator of an iteration of the plan, reproducible when resuming."""
         key = [self._track.cfg.seed, self._track.iteration, number]
         seed = np.random.SeedSequence(key).generate_state(1, np.uint64)[0]
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
     def _execute(self, actions: np.ndarray) -> None:
-        """Take steps in the hard contact model, actions of shape [k, A], and plan from where they lead."""
+        """Execute actions of shape [k, A] in the hard contact model, and plan from the resulting state."""
         simulator = self.problem.simulator
         simulator.set_contact("hard")
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)

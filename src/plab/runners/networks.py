@@ -1,7 +1,7 @@
-"""Networks of many agents as one: stacked parameters of Stable-Baselines3's policies, and their updates.
+"""Batched networks of many agents: stacked parameters of Stable-Baselines3's policies, and their updates.
 
 An update of these small networks has a hundred kernels of a few microseconds each, dominated by the time to
-launch them from Python. On CUDA it is recorded once as a graph and replayed: one launch.
+launch them from Python. On CUDA updates are captured as a graph and replayed with one launch.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from torch.optim import Adam, Optimizer
 
 Part: TypeAlias = "dict[str, Tensor]"
-"""Parameters by their names in the module that they come from, each of shape [stack, ...]; weights are
-transposed, [stack, in, out], so that neither products nor gradients have to be."""
+"""Parameters by name in their module, each of shape [stack, ...]; weights are stored transposed, [stack, in,
+out], to avoid transposing products and gradients."""
 
 
 class Networks:
@@ -80,7 +80,7 @@ def fill(tensors: Sequence[Tensor], agents: int, agent: int, row: Tensor) -> Non
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Return x W + b of each network: shapes [stack, row, in], [stack, in, out], [stack, out]."""
+    """Return x W + b for each network: shapes [stack, row, in], [stack, in, out], [stack, out]."""
     return torch.baddbmm(bias.unsqueeze(1), x, weight)
 
 
@@ -133,7 +133,7 @@ def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> No
 
 
 def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
-    """Let targets follow: target <- (1 - tau) target + tau source."""
+    """Update targets: target <- (1 - tau) target + tau source."""
     with torch.no_grad():
         torch._foreach_lerp_(targets, sources, tau)
 
@@ -145,21 +145,21 @@ WARM_UP = 3
 
 
 class CapturedUpdate:
-    """An update of a model, on CUDA recorded once for each shape of its arguments and replayed from then on.
+    """An update of a model; on CUDA it is captured once per shape of its arguments and then replayed.
 
     The function may change parameters and optimisers in place, and may draw random numbers of the device. It
     must not synchronise with the device, and all data besides its arguments must keep their addresses.
     """
 
     def __init__(self, update: Callable[..., Tensor]) -> None:
-        """Take over an update, a function of tensors that returns one."""
+        """Wrap an update, a function of tensors that returns a tensor."""
         self._update = update
-        # By the arguments' shapes: a graph, the tensors that it takes, and the one that it returns.
+        # By shapes of the arguments: graph, input tensors, and output tensor.
         self._recordings: dict[Any, tuple[torch.cuda.CUDAGraph, tuple[Tensor, ...], Tensor]] = {}
         self._calls = 0
 
     def __call__(self, *arguments: Tensor) -> Tensor:
-        """Update; the tensor returned is overwritten by the next call."""
+        """Update; the next call overwrites the returned tensor."""
         if not arguments[0].is_cuda:
             return self._update(*arguments)
         self._calls += 1
@@ -192,8 +192,7 @@ class CapturedUpdate:
 
 
 def require_capturable(optimizer: Optimizer, lr: float) -> None:
-    """Set the learning rate of Adam on a CUDA device where a recorded step reads it, and make the step one
-    to record."""
+    """Store Adam's learning rate in a CUDA tensor, and make its step capturable."""
     for group in optimizer.param_groups:
         group["capturable"] = True
         if isinstance(group["lr"], torch.Tensor):

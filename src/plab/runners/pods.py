@@ -1,12 +1,12 @@
-"""Policy optimization via differentiable simulation: ``pods``, a policy that imitates its own episodes, once
-the simulator's gradient has improved them.
+"""Policy optimization via differentiable simulation: ``pods``, a policy that imitates its own episodes,
+improved by the simulator's gradient.
 
-After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates of Adam
-in place of a step of gradient descent or of second order. In a round the policy acts, in each scene; the
-actions that it took are improved by some updates along the gradient of the trajectory's loss; they are run
-again, and the policy learns to take them where they lead, and where it came without them. The gradient
-improves action sequences, which is much easier than improving a network. The sequences of different scenes
-remain similar, because all of them start from the policy. If there are more scenes than environments, rounds
+After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates by Adam
+instead of gradient descent or second-order steps. In each round the policy acts in each scene. Its actions
+are improved by some updates along the gradient of the trajectory loss and simulated again. The policy learns
+the improved actions in the resulting states, and in the states of its own episodes. The gradient improves
+action sequences, which is much easier than improving a network. The sequences of different scenes remain
+similar, because all of them start from the policy. If there are more scenes than environments, rounds
 alternate between them, and the policy imitates the latest actions of each scene. To reproduce a result:
 
     python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true observe_particles=10 \
@@ -36,11 +36,12 @@ class PodsConfig(ActorConfig):
 
     Attributes:
         updates: Updates of the actions by their gradient in a round.
-        action_lr: Learning rate of these, in units of an action.
-        epochs: Passes of the policy, after a round, over as many actions as the round has.
+        action_lr: Learning rate of the actions, in units of an action.
+        epochs: Training passes after a round, each over as many actions as the round has.
         batch_size: Actions per update of the policy.
-        observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
-        shift: Largest shift of all positions in these observations along x and along z [domain units].
+        observation_noise: Standard deviation of the noise on observations, relative to their standard
+            deviation.
+        shift: Largest common shift of observed positions along x and z [domain units].
     """
 
     updates: int = field(metadata=ranges.COUNT)
@@ -52,7 +53,7 @@ class PodsConfig(ActorConfig):
 
 
 class PodsTraining(Imitation):
-    """A policy and the rounds of episodes from which it learns."""
+    """A policy and its rounds of training episodes."""
 
     columns = ("train_reward", "train_score", "plan_reward", "plan_score")
 
@@ -82,14 +83,14 @@ class PodsTraining(Imitation):
             self.statistics.update(seen.double().cpu().numpy())
             self.freeze_moments()
             set_rate(self._optimizer, method.lr * rate_left)
-            # Of each scene the last time that it was its turn.
+            # The latest round of each scene.
             self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]
             every, given = map(torch.cat, zip(*self._rounds, strict=True))
             count = math.ceil(method.epochs * len(seen) / method.batch_size)
             self.imitate(self.scaled(every), given, count)
 
     def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Run an episode of given actions, shape [env, T, A], or of the policy, and note reward and score
+        """Run an episode with given actions, shape [env, T, A], or the policy, and record reward and score
         under a name; return observations before each step, shape [env, T, entry], and actions."""
         from plab.envs.tensors import TensorEnv
 
@@ -108,8 +109,7 @@ class PodsTraining(Imitation):
         return torch.stack(observed, 1), torch.stack(taken, 1)
 
     def _improved(self, actions: torch.Tensor, rate: float) -> torch.Tensor:
-        """Return actions, shape [env, T, A], after updates by Adam along the gradient of the trajectory's
-        loss."""
+        """Return actions, shape [env, T, A], improved by Adam along the gradient of the trajectory loss."""
         plan = torch.nn.Parameter(actions.clone())
         optimizer = torch.optim.Adam([plan], lr=rate)
         for _ in range(self._method.updates):
@@ -139,7 +139,7 @@ class PodsTraining(Imitation):
 
 
 class PodsRunner(ActorRunner):
-    """Runner of a policy; each iteration is some rounds, then one episode of the policy."""
+    """Runner of a policy; each iteration consists of some rounds and one evaluation episode."""
 
     training = PodsTraining
 

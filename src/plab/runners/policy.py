@@ -1,4 +1,4 @@
-"""Trained policies: their keys, settings of torch, and the file that keeps a policy.
+"""Trained policies: keys, settings of torch, and policy files.
 
 The file beside a result, ``<name>.policy.npz``, contains only arrays: the parameters of the networks by name,
 the bounds of observations and actions, and a JSON header with the section ``method`` of the run, from which
@@ -98,9 +98,9 @@ class Spaces(NamedTuple):
 
 @contextmanager
 def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
-    """Let torch use some CPU threads, on CUDA TF32's products, of factors with 11 significant bits, if
-    ``tf32``, and not check distributions' arguments, inside the ``with`` block. The checks cost a tenth of
-    an update; states and losses are checked for NaN anyway."""
+    """Set torch's CPU threads, enable TF32 products on CUDA if ``tf32``, and disable checks of distribution
+    arguments, inside the ``with`` block. The checks take a tenth of an update, and states and losses are
+    checked for NaN elsewhere."""
     before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
     precision = torch.get_float32_matmul_precision()
     torch.set_num_threads(threads)
@@ -116,7 +116,7 @@ def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
 
 
 def packed(state: Mapping[str, Any]) -> np.ndarray:
-    """Return tensors and numbers in nested dictionaries and lists as torch saves them, as bytes."""
+    """Serialise tensors and numbers in nested dictionaries and lists with torch.save."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     return np.frombuffer(buffer.getvalue(), np.uint8)
@@ -142,17 +142,16 @@ class Policy:
     """A trained policy, deterministic.
 
     Attributes:
-        network: Stable-Baselines3's policy, which wants observations as it has seen them in training.
+        network: Stable-Baselines3's policy with the scaling of observations used in training.
     """
 
     def __init__(self, network: BasePolicy, mean: np.ndarray | None, variance: np.ndarray | None) -> None:
-        """Take over a network; means and variances scale the observations, shape [entry], unless None."""
+        """Wrap a network; means and variances, shape [entry], scale the observations, unless None."""
         self.network = network
         self._mean, self._variance = mean, variance
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions, shape [env, action], for observations as the environments give them, shape [env,
-        entry]."""
+        """Return actions, shape [env, action], for observations from environments, shape [env, entry]."""
         if self._mean is not None and self._variance is not None:
             scaled = (observation - self._mean) / np.sqrt(self._variance + EPSILON)
             observation = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
@@ -160,7 +159,7 @@ class Policy:
 
 
 def policy_path(result: Path) -> Path:
-    """Return the file of the policy of a run with this result file."""
+    """Return the path of the policy file for a result file."""
     return result.with_suffix(".policy.npz")
 
 
@@ -192,7 +191,7 @@ def save_policy(
 
 
 def load_policy(result: str | Path, device: str = "cpu") -> Policy:
-    """Return the policy that a run has trained.
+    """Load the trained policy of a run.
 
     Args:
         result: The run's result file, as in the column ``path`` of a table of results.
@@ -232,7 +231,7 @@ def _policy(path: Path) -> Policy:
     spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
     own = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in own}
-    # Before networks of that size are made.
+    # Checked before networks of that size are created.
     observed, actions = spaces.sizes
     widths = [observed, *getattr(method, "hidden", ()), actions]
     needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
@@ -245,7 +244,7 @@ def _policy(path: Path) -> Policy:
 
 
 def _method(section: Any, path: Path) -> PolicyConfig:
-    """Return the section ``method`` that a policy's header holds, of the type of its family."""
+    """Return the section ``method`` of a policy's header, with the type of its family."""
     name = str(section["family"])
     # A file must not determine imports.
     if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:

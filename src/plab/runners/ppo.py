@@ -26,7 +26,7 @@ class PpoConfig(RlConfig):
     """Proximal policy optimisation.
 
     Attributes:
-        lr_decay: Let the learning rate fall linearly to 0 over the run.
+        lr_decay: Decrease the learning rate linearly to 0 over the run.
         steps_per_update: Transitions per update.
         minibatches: Minibatches of each epoch.
         epochs: Passes over the transitions of an update.
@@ -35,15 +35,15 @@ class PpoConfig(RlConfig):
         value_clip_range: Largest change of the value; None sets no limit.
         value_coefficient: Weight of the value function's mean squared error.
         entropy_coefficient: Weight of the policy's entropy.
-        entropy_mean: Take the mean of the entropies of an action's components; else their sum.
-        max_gradient_norm: Longer gradients are scaled down to this norm.
+        entropy_mean: Use the mean of the entropies of an action's components instead of their sum.
+        max_gradient_norm: Largest norm of the gradient; larger gradients are scaled down.
         adam_eps: Added to adam's denominator.
         normalise: Scale observations and rewards by running statistics.
         statistics_episodes: Episodes after which the statistics of observations are frozen; None: never.
-        bootstrap: Add the value of an episode's last observation to its rewards; else the episode is taken to
-            end there.
-        policy_gain: Gain of the first weights, which are orthogonal, of the policy's last layer.
-        value_gain: The same of the value function's.
+        bootstrap: Bootstrap the value of an episode's last observation; otherwise the episode is treated as
+            terminated.
+        policy_gain: Gain of the initial orthogonal weights of the policy's last layer.
+        value_gain: Gain of the value function's last layer.
     """
 
     lr_decay: bool
@@ -66,7 +66,7 @@ class PpoConfig(RlConfig):
 
     def check(self, path: str) -> None:
         super().check(path)
-        # Advantages are standardised: a minibatch needs two of them.
+        # Advantages are standardised, so a minibatch needs at least two.
         if self.minibatches > self.steps_per_update // 2:
             most = self.steps_per_update // 2
             raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
@@ -82,13 +82,13 @@ class Statistics:
     """
 
     def __init__(self, agents: int, *shape: int, device: torch.device) -> None:
-        """Begin with mean 0 and variance 1, of next to no rows."""
+        """Initialise with mean 0 and variance 1, with negligible weight."""
         self.mean = torch.zeros((agents, *shape), dtype=torch.float64, device=device)
         self.var = torch.ones_like(self.mean)
         self.count = torch.full((agents, 1), 1e-4, dtype=torch.float64, device=device)
 
     def update(self, rows: Tensor) -> None:
-        """Take rows, shape [agent, row, ...]."""
+        """Update with rows, shape [agent, row, ...]."""
         rows, count = rows.double(), rows.shape[1]
         mean, var = rows.mean(1), rows.var(1, correction=0)
         delta, total = mean - self.mean, self.count + count
@@ -99,10 +99,10 @@ class Statistics:
 
 
 class PpoAgents(Agents):
-    """Agents of PPO; observations and rewards are scaled by running statistics if the method wants it."""
+    """PPO agents; observations and rewards are optionally scaled by running statistics."""
 
     PARTS: ClassVar = {
-        # Both as wide: evaluated as one.
+        # Equal widths, so both are evaluated together.
         "hidden": ("mlp_extractor.policy_net", "mlp_extractor.value_net"),
         "mean": ("action_net",),
         "value": ("value_net",),
@@ -119,7 +119,7 @@ class PpoAgents(Agents):
         self._length = self.cycle_steps(self.method, self.sizes.horizon) // envs
         few = self.method.statistics_episodes
         self._watched = math.inf if few is None else few * self.sizes.horizon
-        # Of the sum of the entropies of an action's components.
+        # Coefficient of the sum of the entropies of an action's components.
         divisor = self.sizes.actions if self.method.entropy_mean else 1
         self._entropy = self.method.entropy_coefficient / divisor
         self._seen = Statistics(agents, self.sizes.observed, device=device)
@@ -161,12 +161,12 @@ class PpoAgents(Agents):
         return method.num_envs * math.ceil(method.steps_per_update / method.num_envs)
 
     def begin(self, observations: Tensor) -> None:
-        """Take the very first observations into the statistics."""
+        """Include the initial observations in the statistics."""
         if self.method.normalise:
             self._seen.update(observations)
 
     def act(self, observations: Tensor) -> Tensor:
-        """Draw actions; they may lie beyond [-1, 1], which the environments do not."""
+        """Sample actions, which may be outside [-1, 1]; environments clip them."""
         step = len(self._over)
         seen = self.scaled(observations)
         with torch.no_grad():
@@ -184,7 +184,7 @@ class PpoAgents(Agents):
             return self._evaluate(self.scaled(observations))[0].clamp(-1.0, 1.0)
 
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
-        """Keep the transitions, and make an update of every ``steps_per_update``."""
+        """Store the transitions, and update after every ``steps_per_update``."""
         if self.method.normalise:
             if self.steps < self._watched:
                 self._seen.update(observations)
@@ -206,15 +206,15 @@ class PpoAgents(Agents):
         self.steps += self.sizes.envs
 
     def scaled(self, observations: Tensor) -> Tensor:
-        """Return observations as the networks want them, shape [agent, row, entry]."""
+        """Return scaled observations for the networks, shape [agent, row, entry]."""
         if not self.method.normalise:
             return observations
         mean, std = self._seen.mean.unsqueeze(1), (self._seen.var + EPSILON).sqrt().unsqueeze(1)
         return ((observations - mean) / std).clamp(-CLIP, CLIP).float()
 
     def judge(self, last_values: Tensor, over: Sequence[bool]) -> None:
-        """Compute advantages and returns of the rollout, by the values after its last step, shape [agent,
-        env], and whether the episodes were over after each step."""
+        """Compute advantages and returns of the rollout, given the values after its last step, shape [agent,
+        env], and the ends of episodes."""
         gamma, table = self.method.gamma, self.rollout
         goes_on = 1.0 - torch.tensor(over, dtype=torch.float32, device=self.device)
         values = table["values"]
@@ -229,9 +229,8 @@ class PpoAgents(Agents):
         table["returns"].copy_(table["advantages"] + values)
 
     def minibatch(self, numbers: Tensor) -> Tensor:
-        """Update from some transitions of the rollout, numbered step after step of the first environment,
-        then the next, shape [agent, row]; return the losses of policy, value and entropy, shape [3,
-        agent]."""
+        """Update from some transitions of the rollout, shape [agent, row], numbered by environment, then
+        step; return the losses of policy, value and entropy, shape [3, agent]."""
         m = self.method
         where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
         observations, actions = (

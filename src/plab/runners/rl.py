@@ -1,8 +1,8 @@
 """Reinforcement learning: ``sac``, ``td3`` and ``ppo``, one agent or many at once.
 
-The runs of a sweep that have the same section ``method`` are a population: agents and their environments in
-one simulator, with a file for each. A run alternates between training, for some episodes, and one episode of
-the deterministic policy, which gives a row of the results. To reproduce a result:
+Runs of a sweep with the same section ``method`` form a population: agents and their environments in one
+simulator, with one file each. A run alternates between training, for some episodes, and one episode of the
+deterministic policy, which gives a row of the results. To reproduce a result:
 
     python -m plab.run task=Torus variant=1 method=ppo seed=0
 """
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 
 def agents_of(method: RlConfig) -> type[Agents]:
-    """Return the agents that learn by a method's algorithm."""
+    """Return the agents of a method's algorithm."""
     return family(method.family).rules[method.algorithm].what
 
 
 class Population(Training):
-    """Agents that stand at the same step, and their environments.
+    """Agents in lockstep, and their environments.
 
     On CUDA the agents' parameters are stacked. On the CPU each agent is a separate stack: libraries select
     kernels by shape, so a joint stack would not be bitwise identical to a single agent.
@@ -50,10 +50,10 @@ class Population(Training):
     """
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Build untrained agents, of configurations alike in ``method``.
+        """Build untrained agents for configurations with the same section ``method``.
 
         Raises:
-            plab.runners.RunError: If there is no room for their replay buffers.
+            plab.runners.RunError: If their replay buffers do not fit into memory.
         """
         from plab.envs.tensors import TensorEnv
 
@@ -76,7 +76,7 @@ class Population(Training):
         self._observations: Any = None
         self._broken: dict[int, list[str]] = {}
         self._ended: list[Tensor] = []
-        # Of the episodes under way: actions, and those of each agent's checkpoint.
+        # Actions of the current episodes, and those of each agent's checkpoint.
         self._actions: list[Tensor] = []
         self._restored: dict[int, np.ndarray] = {}
 
@@ -104,7 +104,7 @@ class Population(Training):
         table = torch.stack(ended).cpu().numpy() if ended else np.full((1, 2, len(losses), 1), np.nan)
         learned = []
         for k, own in enumerate(losses):
-            # Summed agent by agent, for the same bits in any company.
+            # Summed per agent, to be bitwise independent of the population.
             means = {name: float(np.mean(table[:, i, k].copy())) for i, name in enumerate(self.columns)}
             learned.append(TrainingSummary(means, len(ended) * self._envs, broken.get(k, ()), own))
         return learned
@@ -135,7 +135,7 @@ class Population(Training):
         return stack.policy(number)
 
     def _start(self) -> Tensor:
-        """Begin the first episodes, or run those of the checkpoint to where it was written; return the
+        """Begin the first episodes, or replay those of the checkpoint to its step; return the
         observations."""
         for stack in self.stacks:
             stack.watched = self.watched
@@ -185,7 +185,7 @@ class Population(Training):
 
 
 def _require_memory(count: int, each: float, device: str, memory: float) -> None:
-    """Raise RunError if there is no room for as many replay buffers; on the CPU there always is for one."""
+    """Raise RunError if the replay buffers do not fit into memory; one always fits on the CPU."""
     # The memory of the networks is negligible in comparison.
     room = 0.9 * torch.cuda.mem_get_info()[0] if device == "cuda" else max(memory, each)
     if count * each > room:
@@ -196,7 +196,7 @@ def _require_memory(count: int, each: float, device: str, memory: float) -> None
 
 
 class RlRunner(PolicyRunner):
-    """Runner of agents, side by side."""
+    """Runner of a population of agents."""
 
     training = Population
 
@@ -210,7 +210,7 @@ FAMILY = Family(
     config=RlConfig,
     runner=RlRunner,
     columns=("train_reward", "train_score"),
-    # No episode of training may have ended.
+    # There may be no completed training episode.
     may_be_nan=("train_reward", "train_score"),
     batching=True,
     in_step=True,
@@ -237,4 +237,4 @@ SB3 = Family(
     contact="hard",
     kind=RL,
 )
-"""Template of the records of algorithms from outside, which add their ``config`` and ``rules``."""
+"""Template for records of external algorithms, which add their ``config`` and ``rules``."""

@@ -37,15 +37,15 @@ FINAL_STATE_COLUMNS = ("iou", "score")
 
 
 class Runner:
-    """Base of runners, which take the runs of a batch from where their files stand to the end.
+    """Base of runners, which execute a batch of runs, resuming from their files.
 
-    A family overrides :meth:`build`, and :meth:`step` or :meth:`iterate`; the other hooks where it has to.
-    They are called in this order: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate`
-    while any :meth:`has_more`, :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
+    A family overrides :meth:`build`, :meth:`step` or :meth:`iterate`, and other hooks as needed. Order of
+    calls: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any
+    :meth:`has_more`, :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
 
     Attributes:
-        tracks: The runs; there is one where runs cannot share a simulator.
-        problem: Problem in which the best actions are judged, an environment per run; :meth:`build` sets it.
+        tracks: The runs; a single one if runs cannot share a simulator.
+        problem: Problem for evaluating the best actions, with an environment per run; set by :meth:`build`.
         cache: Simulators of earlier runs.
         report: Function of the batch's progress and a short text; see :mod:`plab.progress`.
     """
@@ -86,10 +86,10 @@ class Runner:
         return cast(int, row_count(asdict(track.cfg.method)))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Do one iteration of each of some runs, wherever it stands; by default :meth:`step` of each.
+        """Make the next iteration of some runs; by default :meth:`step` of each.
 
         Args:
-            tracks: The runs that have more to do.
+            tracks: The unfinished runs.
 
         Yields:
             The successful runs; mark failed ones with :meth:`Track.fail`.
@@ -98,13 +98,13 @@ class Runner:
             yield track, self.step(track)
 
     def step(self, track: Track) -> Step:
-        """Do one iteration of one run.
+        """Make one iteration of one run.
 
         Raises:
-            plab.sim.SimulationError: If a state, loss or gradient stops being finite.
-            plab.runners.RunError: If it cannot go on for another reason.
+            plab.sim.SimulationError: If a state, loss or gradient diverges.
+            plab.runners.RunError: If it fails for another reason.
         """
-        # Not abstract, as build: a family that overrides iterate() has no step.
+        # Not abstract like build, because a family that overrides iterate() has no step.
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
@@ -139,8 +139,8 @@ class Runner:
     # ------------------------------------------------------------------------------------ for use in hooks
 
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
-        """Count the wall time from now on as that of another phase, of other runs if some are given; an
-        empty phase is none."""
+        """Attribute the wall time from now on to another phase, and to other runs if given; an empty phase is
+        not counted."""
         now = time.perf_counter()
         if self._phase:
             for track in self._timed:
@@ -148,7 +148,7 @@ class Runner:
         self._phase, self._since, self._timed = phase, now, list(tracks or self._timed)
 
     def actions_at_rest(self) -> np.ndarray:
-        """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
+        """Return zero actions for all environments, shape [batch, T, A], for finished runs."""
         scene = self.problem.scenes[0]
         return np.zeros((len(self.tracks), scene.horizon, scene.action_dim))
 
@@ -159,10 +159,10 @@ class Runner:
         """Execute the runs; a failed run does not affect the others.
 
         Raises:
-            TogetherError: If nothing can be built of several runs: perhaps fewer do.
-            plab.config.ConfigError: If something that the configuration asks for is not there.
-            plab.results.ResultsError: If the file of a lone run cannot be written.
-            plab.runners.RunError: If a lone run cannot be built, or no run can go on.
+            TogetherError: If several runs do not fit into one simulator, but fewer might.
+            plab.config.ConfigError: If a required package or device is missing.
+            plab.results.ResultsError: If the file of a single run cannot be written.
+            plab.runners.RunError: If a single run cannot be built, or all runs have failed.
         """
         from plab.config.compose import require_runnable
         from plab.sim import DeviceError
@@ -243,7 +243,7 @@ class Runner:
                     self.tell(rows, active)
 
     def _conclude(self) -> None:
-        """Run the best actions in the hard contact model, and finish the files."""
+        """Evaluate the best actions in the hard contact model, and finish the files."""
         for track in (one for one in self.tracks if one.open):
             try:
                 self.conclude(track)
@@ -288,8 +288,8 @@ class Runner:
 
 
 class SimulatorCache:
-    """Last simulator of several runs, in whatever it is part of, and its key: a sweep over seeds compiles
-    once."""
+    """Cache of the last simulator, or an object that holds it, with its key, so that a sweep over seeds
+    compiles once."""
 
     def __init__(self) -> None:
         self._kept: dict[Any, Any] = {}
@@ -297,12 +297,12 @@ class SimulatorCache:
     def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
         """Return the cached object of the last run if its key is equal and ``check`` does not raise
         RuntimeError (its memory is invalid); otherwise a new one from ``build``."""
-        # Somebody else may have restarted Taichi with another precision or device.
+        # Other code may have restarted Taichi with another precision or device.
         with suppress(RuntimeError):
             if key in self._kept:
                 check(self._kept[key])
                 return self._kept[key]
-        # Before there is a new one: only then does Taichi find its compiled kernels again.
+        # Release before building a new one, so that Taichi finds its compiled kernels.
         self.clear()
         self._kept[key] = build()
         return self._kept[key]
@@ -332,14 +332,13 @@ def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
 
 
 def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of an episode's measures, for a loss of these terms."""
+    """Return the columns of an episode's measures, given the loss terms."""
     first, *rest = COLUMNS
     return (first, *(f"loss_{name}" for name in term_names), *rest)
 
 
 def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
-    """Return the problem of some configurations, with the simulator kept from the last runs if it can be of
-    these scenes."""
+    """Return the problem for some configurations, reusing the last simulator if it is compatible."""
     from plab.problem import Problem, build_scenes, make_simulator
 
     scenes = build_scenes(cfgs)
@@ -360,7 +359,7 @@ def simulator_key(cfg: Config, scene: Scene) -> Hashable:
 @contextmanager
 def simulation_errors(when: str = "") -> Iterator[None]:
     """Convert errors of the simulator into RunError, and those about insufficient memory into ConfigError;
-    ``when`` goes before the message."""
+    ``when`` is prepended to the message."""
     from plab.sim import DeviceError, SimulationError
 
     try:

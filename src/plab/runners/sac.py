@@ -30,7 +30,7 @@ class SacConfig(OffPolicyConfig):
 
 
 class SacAgents(OffPolicyAgents):
-    """Agents of soft actor-critic; targets follow at every update."""
+    """Agents of soft actor-critic; targets are updated at every step."""
 
     PARTS: ClassVar = {
         "actor": ("actor",),
@@ -53,7 +53,7 @@ class SacAgents(OffPolicyAgents):
 
     @staticmethod
     def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
-        """Return Stable-Baselines3's policy with the authors' first weights: Glorot's uniform ones, and no
+        """Return Stable-Baselines3's policy with the authors' initial weights: Glorot uniform, zero
         biases."""
         from stable_baselines3.sac.policies import SACPolicy
 
@@ -95,7 +95,7 @@ class SacAgents(OffPolicyAgents):
         with torch.no_grad():
             next_actions, next_log_prob = self._drawn(next_observations, next_noise)
             values = twin_values(networks["targets"], next_observations, next_actions).min(1).values
-            # An episode ends by truncation only: the value of the next observation always counts.
+            # Episodes end only by truncation, so the value of the next observation always counts.
             targets = rewards + self.method.gamma * (values - ent_coef * next_log_prob)
         errors = twin_values(networks["critics"], observations, actions) - targets.unsqueeze(1)
         critic_loss = 0.5 * errors.square().mean(2).sum(1)
@@ -121,6 +121,6 @@ class SacAgents(OffPolicyAgents):
         mean, log_std = self._gaussian(observations)
         plain = mean + log_std.exp() * noise
         actions = torch.tanh(plain)
-        # Of the normal distribution at mean + std noise.
+        # Log density of the normal distribution at mean + std noise.
         density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         return actions, (density - torch.log(1.0 - actions.square() + EPSILON)).sum(2)

@@ -1,8 +1,8 @@
 """Learning algorithms with the interface of Stable-Baselines3, such as those of sb3-contrib, as methods.
 
-plab's own ``sac``, ``td3`` and ``ppo`` are in :mod:`plab.runners.rl`. An algorithm from outside needs a
-record with ``replace(FAMILIES["sb3"], ...)`` and a :class:`ModelKind`; see docs/own_method.md. Checkpoints
-are written by the library's ``save``, which uses pickle, so resume only your own runs.
+plab's own ``sac``, ``td3`` and ``ppo`` are in :mod:`plab.runners.rl`. An external algorithm needs a record
+with ``replace(FAMILIES["sb3"], ...)`` and a :class:`ModelKind`; see docs/own_method.md. Checkpoints are
+written by the library's ``save``, which uses pickle, so resume only your own runs.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from plab.runners.training import PolicyRunner, Training, TrainingSummary
 
 @dataclass(frozen=True)
 class ModelKind:
-    """A learning algorithm, and the arguments that a configuration gives it.
+    """A learning algorithm, and its arguments as a function of the configuration.
 
     Attributes:
         model: Class with the interface of Stable-Baselines3's algorithms.
         arguments: Function of the section ``method`` and the environments that returns keyword arguments of
             the class, ``policy_kwargs`` among them.
         rollout_steps: Function of the section ``method`` that returns the number of steps of each environment
-            between updates, for on-policy algorithms; None of one with a replay buffer, which can pause after
+            between updates, for on-policy algorithms; None for off-policy algorithms, which can pause after
             any episode.
     """
 
@@ -53,13 +53,13 @@ class ModelKind:
     rollout_steps: Callable[[Any], int] | None = None
 
     def make_policy(self, method: Any, spaces: Spaces) -> BasePolicy:
-        """Return the policy with which a model would begin, on the CPU."""
+        """Return the initial policy of a model, on the CPU."""
         options = self.arguments(method, spaces)["policy_kwargs"]
         return self.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
 
 
 def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
-    """Return the arguments that all algorithms with a replay buffer take."""
+    """Return the common arguments of off-policy algorithms."""
     return {
         "learning_rate": method.lr,
         "gamma": method.gamma,
@@ -183,7 +183,7 @@ class Sb3Runner(PolicyRunner):
 
 
 class _Replay(LibraryBuffer):
-    """Replay buffer of the library's interface, of episodes that are all equally long and end by truncation.
+    """Replay buffer with the library's interface, for episodes of equal length that end by truncation.
 
     Attributes:
         kept: Its transitions.
@@ -203,7 +203,7 @@ class _Replay(LibraryBuffer):
     ) -> None:
         # The base class allocates its own arrays, here with one row each.
         super().__init__(n_envs, observation_space, action_space, device, n_envs, **options)
-        # The library's save makes a list of the tuple.
+        # The library's save converts the tuple to a list.
         self.kept = ReplayBuffer(1, Sizes(*sizes), buffer_size, total_steps, torch.device(self.device))
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
@@ -216,7 +216,7 @@ class _Replay(LibraryBuffer):
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         numbers = torch.as_tensor(np.random.randint(LARGEST, size=(1, batch_size)))  # noqa: NPY002
         observations, actions, after, rewards = self.kept.sample(numbers.to(self.device))
-        # Truncation is no end: the value of the next observation counts.
+        # After truncation the value of the next observation counts.
         ends = torch.zeros((batch_size, 1), device=self.device)
         return ReplayBufferSamples(observations[0], actions[0], after[0], ends, rewards[0][:, None])
 

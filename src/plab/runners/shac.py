@@ -2,9 +2,10 @@
 and from a value function beyond them.
 
 After Xu et al., Accelerated Policy Learning with Parallel Differentiable Simulation (ICLR 2022). Each episode
-is divided into windows. In a window the policy draws its actions; the gradient of the discounted step losses
-and of the value of the last observation goes back through states, observations and actions, and improves the
-policy. Then the value function learns from the window, by TD(lambda). To reproduce a result:
+is divided into windows. In each window actions are sampled from the policy. The gradient of the discounted
+step losses and of the value of the last observation is backpropagated through states, observations and
+actions, and updates the policy. Then the value function is trained on the window by TD(lambda). To reproduce
+a result:
 
     python -m plab.run task=Move variant=1 method=shac seed=0 sim.device=cuda method.torch_device=cuda
 """
@@ -41,14 +42,14 @@ class ShacConfig(ActorConfig):
 
     Attributes:
         gamma: Discount factor.
-        window: Steps through which the gradient goes.
+        window: Number of steps that the gradient is backpropagated through.
         value_lr: Learning rate of the value function.
-        lr_decay: Let the learning rates fall linearly to 0 over the run.
+        lr_decay: Decrease the learning rates linearly to 0 over the run.
         td_lambda: Lambda of the value function's targets.
         tau: Update rate of the target value function at each window.
         value_epochs: Passes of the value function over a window.
         minibatches: Minibatches of each pass.
-        noise: Standard deviation of the actions at first, before the hyperbolic tangent.
+        noise: Initial standard deviation of the actions, before the hyperbolic tangent.
         max_gradient_norm: Longer gradients are scaled down to this norm.
     """
 
@@ -65,10 +66,10 @@ class ShacConfig(ActorConfig):
 
 
 class ShacTraining(ActorTraining):
-    """Policy, value function, their optimisers, and the episodes from which they learn."""
+    """Policy, value function, their optimisers, and training episodes."""
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
+        """Begin; the seed determines the initial weights, the noise of actions and the minibatches."""
         super().__init__(cfgs, batch)
         method = cfgs[0].method_as(ShacConfig)
         with torch.random.fork_rng(devices=[]):
@@ -79,8 +80,8 @@ class ShacTraining(ActorTraining):
 
     @staticmethod
     def make_policy(method: ShacConfig, spaces: Spaces) -> Any:
-        """Return the policy with which training begins, on the CPU. The standard deviation of its actions,
-        before the hyperbolic tangent, is learned, and the same for all observations."""
+        """Return the policy with which training begins, on the CPU. The standard deviation of the actions,
+        before the hyperbolic tangent, is learned and independent of the observation."""
         policy = actor_policy(spaces, method.hidden)
         deviation = torch.full(spaces.action_space.shape, math.log(method.noise))
         policy.log_std = torch.nn.Parameter(deviation)
@@ -88,7 +89,7 @@ class ShacTraining(ActorTraining):
 
     def _draw(self, observations: torch.Tensor) -> torch.Tensor:
         """Draw actions, shape [env, A], for observations, shape [env, entry]."""
-        # All but the hyperbolic tangent.
+        # Without the hyperbolic tangent.
         mean = self.network.mu[:-1](self.scaled(observations))
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device, dtype=mean.dtype)
         return torch.tanh(mean + self.network.log_std.exp() * noise)
@@ -101,7 +102,7 @@ class ShacTraining(ActorTraining):
         parameters = list(self.network.parameters())
         _, info = batch.reset(episode=self.episodes // batch.size)
         initial = torch.as_tensor(info["loss"], dtype=torch.float32, device=self._device)
-        # Rewards in units of the loss at the start.
+        # Rewards relative to the initial loss.
         scale = initial.mean().clamp(min=1e-12)
         left = rate_left if method.lr_decay else 1.0
         set_rate(self._optimizer, method.lr * left)

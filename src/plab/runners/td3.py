@@ -35,7 +35,7 @@ class Td3Config(OffPolicyConfig):
 
 
 class Td3Agents(OffPolicyAgents):
-    """Agents of TD3; actor and targets follow every ``policy_delay``-th update of the critics."""
+    """TD3 agents; actor and targets are updated with every ``policy_delay``-th update of the critics."""
 
     PARTS: ClassVar = {
         "actor": ("actor.mu",),
@@ -56,7 +56,7 @@ class Td3Agents(OffPolicyAgents):
 
     @staticmethod
     def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
-        """Return Stable-Baselines3's policy with its own first weights."""
+        """Return Stable-Baselines3's policy with its default initial weights."""
         from stable_baselines3.td3.policies import TD3Policy
 
         return TD3Policy(
@@ -75,7 +75,7 @@ class Td3Agents(OffPolicyAgents):
             return self._actor("actor", observations)
 
     def update(self) -> None:
-        """Make one update of the critics, and of the actor if it is its turn."""
+        """Make one update of the critics, and of the actor if it is due."""
         delayed = self.updates % self.method.policy_delay != 0
         update, numbers = self.critics if delayed else self.both, self.numbers()
         shape = self.method.batch_size, self.sizes.actions

@@ -20,23 +20,23 @@ from plab.results import BUDGETS, ResultsError, RunFile
 
 
 class RunError(PlabError, RuntimeError):
-    """A run that cannot go on; the message has iteration and reason."""
+    """A run has failed; the message has iteration and reason."""
 
     exit_code = 1
 
 
 class TogetherError(RuntimeError):
-    """Runs that cannot be simulated together: for the error's cause, or as one has failed and the others have
-    to begin again without it."""
+    """Runs cannot be simulated together, because of the error's cause, or because one has failed and the
+    others must restart without it."""
 
 
 def is_refusal(error: Exception) -> bool:
-    """Return whether an error is for the user to put right: a mistake, or a file that cannot be used."""
+    """Return True if the user can correct an error: invalid input, or an unusable file."""
     return isinstance(error, PlabError) and error.exit_code == PlabError.exit_code
 
 
 def describe(error: Exception) -> str:
-    """Return an error's message, of a bug with its type."""
+    """Return an error's message; for a bug, with its type."""
     return str(error) if isinstance(error, PlabError) else f"{type(error).__name__}: {error}"
 
 
@@ -47,19 +47,18 @@ class Step:
     Attributes:
         measures: Measures of the actions: :func:`plab.runners.runner.episode_columns`, and the columns of the
             family. Others are left out.
-        actions: Actions that it ran, in [-1, 1], shape [T, A].
-        state: Start of the next iteration: nested dictionaries of arrays, numbers and strings.
-        episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
-            iteration.
-        steps: Environment steps that they have cost; None: those of the episodes.
-        steps_forward: Environment steps that this iteration has simulated without a gradient; None: those of
-            one episode.
-        steps_gradient: Those that it has simulated with a gradient.
+        actions: Simulated actions, in [-1, 1], shape [T, A].
+        state: State for the next iteration: nested dictionaries of arrays, numbers and strings.
+        episodes: Episodes simulated before this iteration; None: one per iteration.
+        steps: Environment steps simulated before this iteration; default: those of the episodes.
+        steps_forward: Environment steps simulated in this iteration without a gradient; default: those of one
+            episode.
+        steps_gradient: Environment steps simulated in this iteration with a gradient.
         seconds: The run's share of the wall time; None: all of it.
         keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
-        whole: Actions were run to the end; those that were not are never the best.
-        best: Actions that are the best from now on, of an earlier iteration perhaps, that iteration and its
-            loss; None: by the family's ranking.
+        whole: Whether the actions were simulated to the end; incomplete ones are never the best.
+        best: New best actions, possibly of an earlier iteration, with this iteration and its loss; default:
+            by the family's ranking.
     """
 
     measures: Mapping[str, float]
@@ -76,22 +75,22 @@ class Step:
 
 
 class Track:
-    """One run of a batch: configuration, file, place in the batch, progress, and end.
+    """One run of a batch: configuration, file, index in the batch, progress, and outcome.
 
     Attributes:
         cfg: Configuration.
         run: File.
-        number: Number of the run in its batch, and of its environment in a simulator that they share.
+        number: Index of the run in its batch, and of its environment in a shared simulator.
         error: Reason of the failure, if any.
         iteration: Number of the next iteration.
         best_loss: Loss of the best actions so far, NaN before the first iteration.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
-        log: Log of rows and further numbers, as ``logger`` says.
+        log: Log of rows and further numbers, selected by ``logger``.
     """
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
-        """Take up a run where its file stands."""
+        """Resume a run from its file."""
         self.cfg, self.run, self.number = cfg, run, 0
         self.error: Exception | None = None
         self.finished_before = run.finished
@@ -112,16 +111,16 @@ class Track:
 
     @property
     def solved(self) -> bool:
-        """Return whether the run ranks actions by score and has reached the highest."""
+        """Return True if the run ranks actions by score and has reached the highest score."""
         return self._best_score >= SOLVED
 
     @property
     def contact(self) -> str:
-        """Contact model in which its rows are measured."""
+        """Contact model of its rows."""
         return family(self.cfg.method.family).contact or self.cfg.method.contact
 
     def outcome(self) -> Outcome:
-        """Return the end of the run."""
+        """Return the outcome of the run."""
         error = self.error
         if error is None:
             status = "before" if self.finished_before else "finished"
@@ -170,9 +169,9 @@ class Track:
         row |= self._budget
         row |= {name: step.measures[name] for name in columns}
         row["seconds"] = cast(float, step.seconds)
-        # Written so that the first loss beats the NaN that stands for none.
+        # The first loss must beat NaN, which stands for none.
         better = not row["loss"] >= self.best_loss
-        # Of several with the highest score the one of lowest loss.
+        # Among equal scores, the lowest loss wins.
         if self._by_score and row["score"] != self._best_score:
             better = row["score"] > self._best_score
         chosen = (step.actions, self.iteration, row["loss"]) if better and step.whole else step.best
@@ -197,7 +196,7 @@ def title(cfg: Config) -> str:
 
 
 def batch_title(cfgs: Sequence[Config]) -> str:
-    """Return the task and number of runs of a batch; of one run its title."""
+    """Return the task and number of runs of a batch, or the title of a single run."""
     if len(cfgs) == 1:
         return title(cfgs[0])
     return f"{cfgs[0].task.name}, {len(cfgs)} runs"
@@ -208,7 +207,7 @@ _UNFINISHED = {"elsewhere": "under way in another process", "lost": "not under w
 
 @dataclass(frozen=True)
 class Outcome:
-    """End of one run of a sweep.
+    """Outcome of one run of a sweep.
 
     Attributes:
         title: Task, variant, method and seed.
@@ -216,7 +215,7 @@ class Outcome:
         status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (invalid
             input), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
         score: Score of the final evaluation, NaN if there is none.
-        message: Why it has not finished, one line.
+        message: One-line reason why it has not finished.
     """
 
     title: str
@@ -232,15 +231,15 @@ class Outcome:
 
     @property
     def finished(self) -> bool:
-        """Return whether the result is there."""
+        """Return whether the result exists."""
         return self.status in ("finished", "before")
 
 
 def report(outcomes: Sequence[Outcome]) -> int:
-    """Print how a sweep ended in a line, and a line on standard error per run without a result.
+    """Print a summary line of a sweep, and a line on standard error per run without a result.
 
     Returns:
-        Exit code: 0 if every result is there, 2 if something is the user's to put right, else 1.
+        Exit code: 0 if all results exist, 2 for invalid input, otherwise 1.
     """
     count = Counter(one.status for one in outcomes)
     parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
@@ -262,8 +261,8 @@ PROJECT = "plab"
 class RunLog:
     """Log of a run beside its file, as ``logger`` says, opened at the first numbers.
 
-    Each row is logged at the environment steps that its actions have cost, under the names of the results'
-    columns, and the final evaluation under ``final/``.
+    Each row is logged with the simulated environment steps as its step and the columns of results as names,
+    the final evaluation with the prefix ``final/``.
     """
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
@@ -278,8 +277,8 @@ class RunLog:
         return self._cfg.logger != "none"
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers by name at some environment steps, those that are not finite left out; ResultsError
-        if that fails."""
+        """Log numbers by name at an environment step, leaving out non-finite ones; ResultsError if that
+        fails."""
         if not self.wanted:
             return
         try:
@@ -308,7 +307,7 @@ class RunLog:
         def write(values: Mapping[str, float], steps: int) -> None:
             for name, value in values.items():
                 writer.add_scalar(name, value, steps)
-            # To be seen at once.
+            # So that they are visible immediately.
             writer.flush()
 
         return write, writer.close

@@ -1,4 +1,4 @@
-"""Training of policies, one or several in step, and their evaluation in the hard contact model.
+"""Training of one or several policies in lockstep, and their evaluation in the hard contact model.
 
 A method's :class:`Training` holds the policies of a batch of runs. :class:`PolicyRunner` alternates between
 some episodes of training and one episode of each deterministic policy, which gives a row of the results.
@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of an episode of a deterministic policy.
+    """Result of an evaluation episode.
 
     Attributes:
         measures: Values of :func:`plab.runners.runner.episode_columns`.
@@ -86,7 +86,7 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
             for n in columns
         }
         observations = done.observation
-    # From the device at once.
+    # Copied from the device together.
     rows = torch.stack([sums[name] for name in columns]).cpu().numpy().T
     ran = torch.stack(actions, dim=1).cpu().numpy()
     return [
@@ -97,9 +97,9 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) -> list[EpisodeBatch]:
     """Return batches of environments, of some configurations and a contact model each, in their initial
-    states: those kept from the last run if they can be of these scenes."""
+    states: reused from the last run if compatible."""
 
-    # Imported here, as all that brings the simulator along.
+    # Imported here, because it imports the simulator.
     from plab.config import build_scene
     from plab.envs.core import EpisodeBatch
 
@@ -126,7 +126,7 @@ class TrainingSummary:
     """Training of a policy since its last evaluation.
 
     Attributes:
-        measures: Means over the episodes that ended, by the training's columns; NaN if none has.
+        measures: Means over the finished episodes, by the training's columns; NaN if none has.
         ended: Number of these episodes.
         broken: Times and reasons of divergences; these environments were frozen until the end of the episode.
         losses: Mean losses of the updates, by name.
@@ -139,11 +139,11 @@ class TrainingSummary:
 
 
 class Training(ABC):
-    """Policies in training, one per run, which can pause after each cycle: a batch of episodes, or an update.
+    """Policies in training, one per run, in cycles of a batch of episodes or an update.
 
     Attributes:
         batch: Environments of the training.
-        total_steps: Transitions of each policy in the whole training, in whole cycles.
+        total_steps: Total number of transitions per policy, in whole cycles.
         watched: Losses of the updates are requested.
         report: Function to call when episodes have ended.
     """
@@ -152,7 +152,7 @@ class Training(ABC):
     """Measures of :class:`TrainingSummary`."""
 
     round_episodes: tuple[int, int] = 1, 0
-    """Episodes of an environment in a cycle, and those of them with gradient."""
+    """Episodes per environment in a cycle, and episodes with gradient."""
 
     watched = False
     report: Callable[[], None]
@@ -167,15 +167,15 @@ class Training(ABC):
     @property
     @abstractmethod
     def steps(self) -> int:
-        """Transitions of each policy so far."""
+        """Number of transitions per policy so far."""
 
     @property
     def episodes(self) -> int:
-        """Complete episodes of each policy so far."""
+        """Number of complete episodes per policy so far."""
         return self.steps // self._horizon
 
     def train(self, episodes: int) -> None:
-        """Train until each policy has done some episodes, or all its transitions."""
+        """Train until each policy has completed a number of episodes, or all transitions."""
         while self.episodes < episodes and self.steps < self.total_steps:
             self.cycle()
 
@@ -194,12 +194,12 @@ class Training(ABC):
 
     @abstractmethod
     def states(self) -> list[dict[str, Any]]:
-        """Return each policy's state: all that further training depends on, except a replay buffer."""
+        """Return the full training state of each policy, except its replay buffer."""
 
     @abstractmethod
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Return a policy to one of :meth:`states`; RuntimeError, ValueError or LookupError if it is of other
-        networks."""
+        """Restore a policy from one of :meth:`states`; RuntimeError, ValueError or LookupError if it belongs
+        to other networks."""
 
     def write(self, run: int, path: Path) -> None:  # noqa: B027
         """Write a policy's replay buffer, if it has one; ResultsError if that fails."""
@@ -218,12 +218,13 @@ def whole_cycles(steps: int, cycle: int) -> int:
 
 
 class PolicyRunner(Runner):
-    """Runner of policies, side by side; each iteration is some episodes of training, then one of each policy.
+    """Runner of policies in lockstep; each iteration consists of some training episodes and one evaluation
+    episode per policy.
 
-    The runs stand at the same evaluation; once one has failed, the others begin again without it.
+    All runs are at the same evaluation; if one fails, the others restart without it.
 
     Attributes:
-        training: Subclass of :class:`Training`, made of configurations and environments.
+        training: Subclass of :class:`Training`, constructed from configurations and environments.
         policies: The policies in training.
     """
 
@@ -234,14 +235,14 @@ class PolicyRunner(Runner):
 
     @property
     def method(self) -> Any:
-        """The section ``method`` that the runs have in common."""
+        """The common section ``method`` of the runs."""
         return self.tracks[0].cfg.method
 
     def context(self) -> AbstractContextManager[Any]:
         return torch_settings(self.method.torch_threads)
 
     def require_torch_device(self) -> None:
-        """Raise ConfigError, before anything is built, if torch does not have the device."""
+        """Raise ConfigError if the device is not available in torch, before anything is built."""
         if self.method.torch_device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
                 "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
@@ -252,7 +253,7 @@ class PolicyRunner(Runner):
         return [track.cfg for track in self.tracks for _ in range(self.method.num_envs)]
 
     def build(self) -> None:
-        """Make the environments of the training, and those in the hard contact model that judge."""
+        """Create the training environments, and the evaluation environments in the hard contact model."""
         from plab.envs.tensors import TensorEnv
 
         self.require_torch_device()
@@ -265,7 +266,7 @@ class PolicyRunner(Runner):
         self.policies.watched = any(track.log.wanted for track in self.tracks)
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Leave the policy as it begins, or take that of the file and its replay buffer."""
+        """Keep the initial policy, or restore policy and replay buffer from the file."""
         if state is None:
             return
         self.policies.restore(track.number, state)
@@ -276,11 +277,11 @@ class PolicyRunner(Runner):
                 track.fail(error)
 
     def has_more(self, track: Track) -> bool:
-        """Return whether there are steps to train for, or the untrained policy has not been evaluated."""
+        """Return whether training steps remain, or the initial policy has not been evaluated."""
         return track.iteration == 0 or self.policies.steps < self.policies.total_steps
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Train until the next evaluation is due, except before the first, and evaluate all."""
+        """Train until the next evaluation is due, except before the first one, and evaluate all policies."""
         if len(tracks) < len(self.tracks):
             raise TogetherError("a run has failed")
         training, start = self.policies, time.perf_counter()
@@ -291,7 +292,7 @@ class PolicyRunner(Runner):
             self.report(training.episodes, f"{pace:.0f} steps/s {self._shown}")
 
         training.report = report
-        # The first episode, of the untrained policies, compiles the kernels.
+        # The first evaluation, of the initial policies, compiles the kernels.
         if tracks[0].iteration > 0:
             self.enter("optimise")
             last = tracks[0].run.result.columns["episodes"][-1]
@@ -330,7 +331,7 @@ class PolicyRunner(Runner):
             yield track, step
 
     def extent(self) -> tuple[int, int, int]:
-        """Return episodes done and in all, and those between two evaluations."""
+        """Return the numbers of finished and total episodes, and of episodes between evaluations."""
         total = self.policies.total_steps // self.policies.batch.horizon
         return self.policies.episodes, total, self.method.evaluate_every
 

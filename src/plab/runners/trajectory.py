@@ -245,18 +245,18 @@ class UpdateRule:
     Attributes:
         method: Rates.
         actions: Each in [-1, 1], shape [T, A], float64.
-        state: Arrays of the actions' shape or numbers that are kept between updates, by name.
+        state: State between updates by name: arrays of the actions' shape, or numbers.
     """
 
     def __init__(self, method: TrajectoryConfig, shape: tuple[int, int], seed: int) -> None:
-        """Draw the first actions, uniform in +-``method.action_init``."""
+        """Sample the initial actions, uniform in +-``method.action_init``."""
         self.method = method
         self.actions = (2.0 * uniform(seed, shape) - 1.0) * method.action_init
         self.state: dict[str, np.ndarray] = {}
 
     def step(self, gradient: np.ndarray) -> None:
-        """Replace the actions by updated ones, clipped to [-1, 1]; a gradient, shape [T, A], that is longer
-        than ``method.max_gradient_norm`` is scaled down to that."""
+        """Update the actions, clipped to [-1, 1], with a gradient, shape [T, A], whose norm is limited to
+        ``method.max_gradient_norm``."""
         gradient = np.array(gradient, dtype=np.float64)
         if (largest := self.method.max_gradient_norm) is not None:
             gradient *= min(1.0, largest / (float(np.linalg.norm(gradient)) + 1e-6))
@@ -293,7 +293,7 @@ class Momentum(UpdateRule):
 
 
 def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw numbers uniform in [0, 1), float64: those of ``torch.rand`` from a generator of the same seed.
+    """Return uniform numbers in [0, 1), float64, equal to ``torch.rand`` with the same seed.
 
     They are the lower 53 bits of two consecutive outputs of the Mersenne Twister.
     """

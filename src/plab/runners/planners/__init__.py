@@ -1,4 +1,4 @@
-"""Planners: searches for a sequence of actions with many candidates, which a simulator tries together.
+"""Planners: searches for an action sequence with many candidates, simulated in one batch.
 
 :mod:`plab.runners.planners.planner` has their common base.
 """

@@ -1,8 +1,8 @@
-"""Base of the planners: keys, candidates tried in one simulator, starts, stages, and the runner.
+"""Base of planners: keys, evaluation of candidates, starts, stages, and the runner.
 
 A planner is a generator that yields candidates and receives their evaluation; the runner evaluates the
 candidates of all runs of a batch together. Candidates, losses, scores and gradients are tensors on the
-simulator's device. A row of the results is the best candidate of an iteration, always in the hard contact
+simulator's device. A row of the results is the best candidate of an iteration, evaluated in the hard contact
 model.
 """
 
@@ -38,10 +38,10 @@ class PlannerConfig(MethodConfig):
     Attributes:
         algorithm: Search algorithm, one of the family's rules.
         iterations: Rows of the result; the cost of a row depends on the planner.
-        population: Candidates, each a sequence of actions.
+        population: Number of candidates, each an action sequence.
         objective: Ranking of candidates: ``loss``, that of the whole episode; ``final``, that of its
             last step; or ``score``, and the loss where the score is 0.
-        action_init: Random candidates are uniform in +- this.
+        action_init: Half width of the uniform distribution of random candidates.
         contact_starts: Fraction of the initial candidates that move manipulators to the body and push or
             carry it towards the target; the others are random.
     """
@@ -119,7 +119,7 @@ class CandidateStart:
         self._contact = ContactStarts(scene, target)
 
     def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
-        """Draw candidates, shape [count, T, A]: first those that go to the body, then uniform ones."""
+        """Sample candidates, shape [count, T, A]: contact starts first, then uniform ones."""
         size = (count, *self.shape)
         unit = torch.rand(size, generator=random, dtype=torch.float64, device=self.device)
         drawn = (2.0 * unit - 1.0) * method.action_init
@@ -130,13 +130,13 @@ class CandidateStart:
 
 
 class Planner(ABC):
-    """A run's search; subclasses define its beginning and an iteration.
+    """A run's search; subclasses define its start and an iteration.
 
     Attributes:
         method: Its numbers.
         start: Source of the first candidates.
         memory: Tensors that the next iteration depends on.
-        iteration: Number of the iteration that is next.
+        iteration: Number of the next iteration.
     """
 
     def __init__(self, method: PlannerConfig, start: CandidateStart) -> None:
@@ -150,19 +150,19 @@ class Planner(ABC):
 
         Args:
             random: Source of random numbers.
-            found: Candidates of the stage before, the best first, shape [N, T, A]; N is 0 if there is none.
+            found: Candidates of the previous stage, best first, shape [N, T, A]; N is 0 in the first stage.
         """
 
     @abstractmethod
     def iterate(self, random: torch.Generator) -> Asking:
-        """Do an iteration: ask for candidates to be tried, and return the best one."""
+        """Make an iteration: yield candidates for evaluation, and return the best one."""
 
     @abstractmethod
     def candidates(self) -> Tensor:
-        """Return the last candidates, the best first, shape [P, T, A]."""
+        """Return the last candidates, best first, shape [P, T, A]."""
 
     def found(self) -> Tensor:
-        """Return the best actions so far, and after them the last candidates, shape [1 + P, T, A]."""
+        """Return the best actions so far, followed by the last candidates, shape [1 + P, T, A]."""
         return torch.cat([self.memory["champion"][None], self.candidates()])
 
     def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
@@ -184,7 +184,7 @@ class Planner(ABC):
         return actions[best], {name: float(values[best]) for name, values in answer.measures.items()}
 
     def state(self) -> dict[str, Any]:
-        """Return everything that the next iterations depend on, as arrays and numbers."""
+        """Return the state of the search, as arrays and numbers."""
         arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.memory.items()}
         return {"iteration": self.iteration, "memory": arrays}
 
@@ -196,7 +196,7 @@ class Planner(ABC):
 
 
 def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
-    """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
+    """Return the planner for a section ``method``: a single planner or stages."""
     rule = family(method.family).rules[getattr(method, "algorithm")]  # noqa: B009
     return rule.what(method, start)
 
@@ -257,7 +257,7 @@ class Stages:
 
 
 class PlannerRunner(Runner):
-    """Runner that tries the candidates of all runs of a batch together.
+    """Runner that evaluates the candidates of all runs of a batch together.
 
     The simulator has as many environments per run as the smallest population, or fewer if memory is limited;
     larger populations are evaluated in parts. A run stops early once its score reaches 1, or if all of its
@@ -265,11 +265,11 @@ class PlannerRunner(Runner):
     """
 
     def context(self) -> AbstractContextManager[Any]:
-        """Give torch one thread of the CPU: its tensors are small."""
+        """Limit torch to one CPU thread, because its tensors are small."""
         return torch_settings(1)
 
     def build(self) -> None:
-        """Make the problem: environment e is for a candidate of run e modulo the number of runs."""
+        """Build the problem; environment e belongs to run e modulo the number of runs."""
         from plab.problem import build_scenes
         from plab.sim.memory import batch_limit
 
@@ -292,11 +292,11 @@ class PlannerRunner(Runner):
             planner.restore(state)
 
     def has_more(self, track: Track) -> bool:
-        """Return whether a run has iterations left: none once it is solved."""
+        """Return whether a run has iterations left and is not solved."""
         return super().has_more(track) and not track.solved
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Let the planners of all runs do one iteration each."""
+        """Make one iteration of the planners of all runs."""
         begin = time.perf_counter()
         spent = {track: {False: 0, True: 0} for track in tracks}
         asking = {track: self._planners[track.number].plan(self._random(track)) for track in tracks}
@@ -331,7 +331,7 @@ class PlannerRunner(Runner):
         return super().judge(np.concatenate([actions] * self._width))
 
     def _random(self, track: Track) -> torch.Generator:
-        """Return the random numbers of a run's next iteration, which a resumed run draws again."""
+        """Return the random generator of a run's next iteration, reproducible when resuming."""
         seed = np.random.SeedSequence([track.cfg.seed, track.iteration]).generate_state(1, np.uint64)[0]
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
@@ -379,7 +379,8 @@ class PlannerRunner(Runner):
 
 
 def _smallest_population(method: Any) -> int:
-    """Return the fewest candidates that are tried at once: further environments would stand still then."""
+    """Return the smallest number of candidates evaluated at once; more environments would sometimes be
+    idle."""
     if hasattr(method, "stages"):
         return min(map(_smallest_population, method.stages.values()))
     return method.population

@@ -1,8 +1,8 @@
 """Search algorithms of the planners.
 
-* ``multistart``: gradient descent (Adam) from many starts, the worse half replaced as it goes.
-* ``cem``, the cross-entropy method: draw curves from a normal distribution, fit it to the best, again.
-* ``mppi``, model-predictive path integral: the mean of all curves, weighted by exp(-cost), again and again;
+* ``multistart``: gradient descent (Adam) from many starts; the worse half is replaced at intervals. *
+``cem``, the cross-entropy method: draw curves from a normal distribution, fit it to the best, again. *
+``mppi``, model-predictive path integral: the mean of all curves, weighted by exp(-cost), again and again;
   over the whole episode: the simulator is deterministic, so that planning anew on the way would gain nothing.
 * ``cmaes``, covariance matrix adaptation of a curve's points, by the library cmaes.
 
@@ -37,12 +37,12 @@ class MultistartConfig(PlannerConfig):
     """Gradient descent from many starts.
 
     Attributes:
-        lrs: Learning rates, which candidates have in turn.
+        lrs: Learning rates, assigned to candidates in turn.
         betas: Decay rates of Adam's two moment estimates.
         eps: Added to Adam's denominator.
         updates: Updates of each candidate per iteration.
-        softness_end: The softness goes from ``softness`` to this over the iterations, by the same factor in
-            each; None: it stays.
+        softness_end: Final softness; it changes geometrically from ``softness`` over the iterations; None: it
+            stays.
         replace_every: Iterations after which the worse half is replaced.
         fresh: Fraction of the replaced candidates with a new start; the others start near a better candidate,
             within ``action_init``.
@@ -86,7 +86,7 @@ class Multistart(Planner):
         self._put(torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]), range(count))
 
     def iterate(self, random: torch.Generator) -> Asking:
-        """Judge the candidates in the hard model, improve all, and replace the worse half if it is time."""
+        """Evaluate the candidates in the hard model, update all, and replace the worse half at intervals."""
         method, softness = self.method, self._softness()
         actions = self._actions()
         answer = shown = yield Request(actions, gradient=softness is None)
@@ -115,7 +115,7 @@ class Multistart(Planner):
         return torch.stack([place.detach() for place in self._places])
 
     def _put(self, actions: Tensor, numbers: Any) -> None:
-        """Put candidates, shape [N, T, A], into places, where they start without moments."""
+        """Place candidates, shape [N, T, A], with zero moments."""
         for place, own in zip(numbers, actions, strict=True):
             self._places[place].data.copy_(own.clamp(-1.0, 1.0))
             self._adam.state.pop(self._places[place], None)
@@ -150,20 +150,20 @@ class Multistart(Planner):
         kept = unpacked(state["torch"])
         self._put(kept["actions"], range(len(self._places)))
         for k, own in kept["moments"].items():
-            # The number of steps stays on the CPU, as Adam has it.
+            # Adam's step count stays on the CPU.
             on = {name: v if name == "step" else v.to(self._places[k].device) for name, v in own.items()}
             self._adam.state[self._places[k]] = on
 
 
 @dataclass
 class SamplerConfig(PlannerConfig):
-    """Keys of the planners that draw candidates and learn from their costs, without a gradient.
+    """Keys of gradient-free planners, which sample candidates and learn from their costs.
 
     Attributes:
         knots: Number of points in time that define the curve of actions, at most one per environment step.
-        curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
+        curve: ``constant``: each point applies to its part of the episode; ``linear``: straight from one to
             the next.
-        spread: Standard deviation of the first draws around the best start, of each point.
+        spread: Standard deviation of the first samples around the best start, at each point.
     """
 
     knots: int = field(metadata=ranges.COUNT)
@@ -191,14 +191,14 @@ def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
 
 
 def knots_of(actions: Tensor, knots: int) -> Tensor:
-    """Return points, shape [P, knots, A], that are means of actions, shape [P, T, A], over their share of the
-    time."""
+    """Return points, shape [P, knots, A], as means of actions, shape [P, T, A], over their parts of the
+    episode."""
     return torch.nn.functional.adaptive_avg_pool1d(actions.transpose(1, 2), knots).transpose(1, 2)
 
 
 class Sampler(Planner):
-    """Planner that draws curves, has them tried, and learns from their costs; first the starts, then around
-    the best."""
+    """Planner that evaluates the starts, then samples curves around the best one and learns from their
+    costs."""
 
     method: SamplerConfig
 
@@ -235,18 +235,18 @@ class Sampler(Planner):
         else:
             self.learn(points, cost)
         if softness is not None:
-            # Rows are of the hard model: that of the best half, so that it is no gamble.
+            # Rows are evaluated in the hard model: all of the best half, to find a reliable best.
             actions = actions[order[: len(order) // 2]]
             answer = yield Request(actions)
         return self.show(actions, answer)
 
     @abstractmethod
     def recentre(self, point: Tensor) -> None:
-        """Begin to draw around a curve, shape [K, A]."""
+        """Start sampling around a curve, shape [K, A]."""
 
     @abstractmethod
     def sample(self, random: torch.Generator) -> Tensor:
-        """Draw curves, shape [P, K, A]; whatever leaves [-1, 1] will be clipped."""
+        """Sample curves, shape [P, K, A]; values outside [-1, 1] will be clipped."""
 
     @abstractmethod
     def learn(self, points: Tensor, cost: Tensor) -> None:
@@ -264,9 +264,9 @@ class CemConfig(SamplerConfig):
     """Cross-entropy method.
 
     Attributes:
-        elites: Candidates that mean and spread are taken from.
-        smoothing: Share of the old mean and spread that is kept.
-        least_spread: The spread falls no lower.
+        elites: Number of candidates that determine mean and standard deviation.
+        smoothing: Weight of the old mean and standard deviation.
+        least_spread: Lower bound of the standard deviation.
     """
 
     elites: int = field(metadata=ranges.within(ranges.at_least, 2))
@@ -301,12 +301,12 @@ class Cem(Sampler):
 
 @dataclass
 class MppiConfig(SamplerConfig):
-    """Model-predictive path integral: the mean of all candidates, weighted by how good they are.
+    """Model-predictive path integral: the mean of all candidates, weighted by cost.
 
     Attributes:
-        temperature: Candidates that are worse than the best by this many standard deviations of the costs
-            weigh 1 / e of it.
-        decay: The spread is multiplied by this after each iteration.
+        temperature: Temperature: a candidate worse than the best by this many standard deviations of the
+            costs has 1 / e of its weight.
+        decay: Factor of the standard deviation per iteration.
     """
 
     temperature: float = field(metadata=ranges.POSITIVE)
@@ -314,7 +314,7 @@ class MppiConfig(SamplerConfig):
 
 
 class Mppi(Sampler):
-    """Sampler that learns the mean alone; the spread falls with the iterations."""
+    """Sampler that learns only the mean; the standard deviation decays over the iterations."""
 
     method: MppiConfig
 
@@ -326,7 +326,7 @@ class Mppi(Sampler):
         return self.memory["mean"] + spread * self.noise(random)
 
     def learn(self, points: Tensor, cost: Tensor) -> None:
-        """Weigh the curves by their costs, in units of the costs' standard deviation."""
+        """Weight the curves by cost, in units of the costs' standard deviation."""
         through = cost[cost.isfinite()]
         scale = through.std(correction=0).clamp(min=1e-12) * self.method.temperature
         weights = torch.softmax(-(cost - through.min()) / scale, dim=0)
@@ -339,7 +339,7 @@ class CmaesConfig(SamplerConfig):
 
 
 class Cmaes(Sampler):
-    """Search of the library over the points of a curve, end to end, on the host: tens of numbers."""
+    """The library's search over the concatenated points of a curve, on the host."""
 
     method: CmaesConfig
     _search: CMA
@@ -349,7 +349,8 @@ class Cmaes(Sampler):
 
         flat = point.flatten().cpu().numpy()
         bounds = np.stack([-np.ones_like(flat), np.ones_like(flat)], axis=1)
-        # Not drawn again where it leaves the bounds, but clipped: in many dimensions nearly all would.
+        # Samples outside the bounds are clipped instead of redrawn, because in many dimensions nearly all are
+        # outside.
         self._search = CMA(
             flat,
             self.method.spread,
@@ -359,7 +360,7 @@ class Cmaes(Sampler):
         )
 
     def sample(self, random: torch.Generator) -> Tensor:
-        # The library draws with its own generator, from a seed of the iteration's.
+        # The library has its own generator, seeded per iteration.
         self._search.reseed_rng(int(torch.randint(2**31, (1,), generator=random, device=self.start.device)))
         drawn = np.stack([self._search.ask() for _ in range(self.method.population)])
         return torch.as_tensor(drawn, device=self.start.device).reshape(-1, self.knots, self.start.shape[1])
@@ -373,7 +374,7 @@ class Cmaes(Sampler):
 
     def state(self) -> dict[str, Any]:
         held = self._search.__getstate__()
-        # Copies: the library changes some of its arrays in place.
+        # Copies: the library modifies some arrays in place.
         return super().state() | {"search": {name: np.array(v) for name, v in held.items() if v is not None}}
 
     def restore(self, state: Mapping[str, Any]) -> None:

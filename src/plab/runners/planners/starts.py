@@ -1,10 +1,11 @@
-"""Starts that bring manipulators to the body: contact points, found from where the mass has to go.
+"""Contact starts: initial action sequences that move manipulators to contact points, derived from the
+required transport of mass.
 
-Some points of the body are assigned to as many of the target so that the ways are shortest in all (optimal
-transport). A start either pushes, each manipulator behind one of the points and along its way, or carries:
-each manipulator goes to the body nearest to it, presses, and takes the body's middle way. Of the target
-nothing is known but its mass tensor. Paths are straight, so obstacles may be hit; with several bodies, some
-paths lead over them. Bodies that no manipulator is near to are taken to stay.
+Points of the body are assigned to points of the target by optimal transport. A start either pushes, with each
+manipulator behind one of the points and along its displacement, or carries: each manipulator moves to the
+nearest body, presses, and follows the body's mean displacement. Only the mass tensor of the target is used.
+Paths are straight, so obstacles may be hit; with several bodies, some paths lead over them. Bodies without a
+manipulator nearby are assumed to stay.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ from plab.scenes import ROLL_RADIUS, Manipulator, Scene, sample_particles
 from plab.targets.scripted import ActionTrack
 
 POINTS = 256
-"""Points of the body, and of the target."""
+"""Number of points of the body and of the target."""
 
 ALIGNMENTS = 10
-"""Assignments of several bodies, each after moving them by their middle ways; the last change nothing."""
+"""Number of assignments for several bodies, each after moving them by their mean displacements; later ones
+converge."""
 
 TUBE = 0.04
 """Half width of the swept path in which a manipulator is assumed to make contact [domain units]."""
@@ -39,11 +41,11 @@ UNREACHED_COST = 100.0
 """Weight of the squared distance to the target for points of a body without a manipulator nearby."""
 
 OVERSHOOT = (0.5, 1.5)
-"""Range of how far they push, in ways of the point that they push."""
+"""Range of the pushing distance, relative to the displacement of the pushed point."""
 
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
-    """Return how far a manipulator, as it stands at the start, reaches from its position in a direction.
+    """Return the extent of a manipulator from its position in a direction, at its initial pose.
 
     Args:
         tool: The manipulator; for one that carries between its parts, such as chopsticks, the result is 0.
@@ -62,7 +64,7 @@ class ContactStarts:
         self._tools = [m for m in scene.tools if m.action_dim]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
-        """Draw starts, pushing and carrying in turn.
+        """Sample starts, alternately pushing and carrying.
 
         Args:
             count: Number of starts.
@@ -95,11 +97,12 @@ class ContactStarts:
 
     @cached_property
     def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points of the bodies, shape [point, 3], their ways, likewise, and the numbers of their bodies."""
+        """Points of the bodies, shape [point, 3], their displacements, likewise, and the numbers of their
+        bodies."""
         scene = self._scene
         body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
-        # Evenly over particles and mass, so that each body and each part of the target has its share; and the
-        # first of each body, however small it is.
+        # Distributed evenly over particles and mass, so that all bodies and parts of the target are
+        # represented, with at least one point per body.
         evenly = np.linspace(0, len(body), min(POINTS, len(body)), endpoint=False, dtype=int)
         chosen = np.union1d(evenly, np.unique(body, return_index=True)[1])
         points, body = sample_particles(scene)[chosen], body[chosen]
@@ -143,9 +146,9 @@ class ContactStarts:
                 track.go(_action(tool, self._to_touch(tool, own, own.mean(0), direction) + press * direction))
             tracks.append(track)
         together = max(map(len, tracks), default=0)
-        # Those that hold a body between them must keep pace.
+        # Manipulators that hold a body between them must move at the same speed.
         left = max(2, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
-        # Over other bodies, every other time.
+        # Every second time over other bodies.
         rise = rng.uniform(*ARCH) if len(self._scene.bodies) > 1 and rng.integers(2) else 0.0
         arch = np.array([0.0, rise, 0.0])
         for track, tool in zip(tracks, self._tools, strict=True):
@@ -156,15 +159,15 @@ class ContactStarts:
         return self._actions(tracks)
 
     def _owner(self, tool: Manipulator) -> int:
-        """Return the number of the body nearest to a manipulator, by the bodies' centres."""
+        """Return the number of the body with the centre nearest to a manipulator."""
         centres = np.array([body.center for body in self._scene.bodies])
         return int(np.linalg.norm(centres - np.asarray(tool.position), axis=1).argmin())
 
     def _to_touch(
         self, tool: Manipulator, points: np.ndarray, point: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """Return the way to where a manipulator meets a body, given by points, on its way to one of them in a
-        direction."""
+        """Return the displacement of a manipulator to its contact with a body, given by points, when
+        approaching one of them along a direction."""
         along = (points - point) @ direction
         aside = np.linalg.norm(points - point - along[:, None] * direction, axis=1)
         met = point + along[aside < TUBE].min(initial=0.0) * direction
@@ -178,7 +181,8 @@ class ContactStarts:
 
 
 def _middle_ways(ways: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """Return the way of each body, shape [body, 3]: medians, as some of its points may be sent elsewhere."""
+    """Return the displacement of each body, shape [body, 3], as a median, because some of its points may be
+    assigned elsewhere."""
     return np.stack([np.median(ways[body == b], axis=0) for b in np.unique(body)])
 
 
