@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from plab.bench import speed, workload
+from plab.bench import speed, unseen, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
 
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
@@ -44,3 +45,17 @@ def test_speed_prints_and_writes_complete_rows(
     assert speed.main([*command, "--kinds", GRADIENT, FORWARD]) == 1
     assert [row["what"] for row in read(path)] == [FORWARD]
     assert f"not measured: {GRADIENT}, 2 environment(s): " in capsys.readouterr().err
+
+
+def still(observation: np.ndarray) -> np.ndarray:
+    """A policy of Move that does nothing."""
+    return np.zeros((len(observation), 6))
+
+
+def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
+    table = tmp_path / "unseen.csv"
+    words = [*TINY, "task=Move", "sim.horizon=3", "--scenes", "3", "--together", "2", "--csv", str(table)]
+    assert unseen.main([*words, "--policy", "test_bench:still"]) == 0
+    (row,) = read(table)
+    assert (row["policy"], row["scenes"]) == ("test_bench:still", "3") and float(row["score"]) < 0.05
+    assert unseen.main(words) == 2

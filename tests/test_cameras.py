@@ -113,8 +113,8 @@ def test_environments_observe_by_key():
         one, *_rest, info = env.step(action)
         assert np.abs(info["impulses"]).max() > 0.0
         np.testing.assert_array_equal(one["impulses"], info["impulses"].astype(np.float32))
-        both, *_rest, infos = many.step(np.stack([action, action]))
-    last = infos["final_obs"][1]
+        both, *_rest = many.step(np.stack([action, action]))
+    last = {key: values[1] for key, values in both.items()}
     assert last in env.observation_space and both in many.observation_space
     if DEVICE == "cpu":
         for key, values in one.items():

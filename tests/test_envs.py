@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import pickle
 import sys
@@ -174,8 +175,10 @@ def test_pictures(env: PlabEnv, vector: PlabVectorEnv, monkeypatch: pytest.Monke
 
 def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vector: PlabVectorEnv) -> None:
     makers = [lambda e=e: e for e in singles]
-    reference = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
-    assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    reference = SyncVectorEnv(makers)
+    assert (
+        vector.metadata["autoreset_mode"] == reference.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    )
     for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
         assert getattr(vector, name) == getattr(reference, name)
     others, tested = DummyVecEnv(makers), PlabVecEnv(vector.batch)
@@ -187,12 +190,12 @@ def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vec
 
 
 def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVectorEnv) -> None:
-    for one in (env, vector):
+    for one, duplicate in ((env, copy.deepcopy), (vector, lambda it: pickle.loads(pickle.dumps(it)))):
         one.reset(seed=3)
         actions = [one.action_space.sample() for _ in range(4)]
         for action in actions[:2]:
             one.step(action)
-        state, copied = one.get_state(), pickle.loads(pickle.dumps(one))
+        state, copied = one.get_state(), duplicate(one)
         wanted = [one.step(action) for action in actions[2:]]
         again = one.set_state(state)
         assert data_equivalence(again, copied.set_state(copied.get_state()), exact=True)
@@ -224,6 +227,8 @@ def test_a_reset_follows_changes_of_the_simulator() -> None:
         np.testing.assert_allclose(after[0][-len(wanted) :], wanted, rtol=1e-6)
         _observation, reward, *_ends, info = env.step(np.zeros(6))
         assert reward == pytest.approx(after[1]["loss"] - info["loss"], rel=1e-9)
+    with pytest.raises(TypeError, match="cannot be copied"):
+        copy.deepcopy(env)
     env.close()
 
 

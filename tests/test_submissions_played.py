@@ -111,7 +111,7 @@ def test_many_environments_in_one_simulator(tmp_path: Path) -> None:
     envs.reset()
     for actions in PLANS.swapaxes(0, 1):
         infos = envs.step(actions)[4]
-    scores = infos["final_info"]["score"]
+    scores = infos["score"]
     (one,), (two,) = (read(tmp_path / f"RollingPin-v{v}.plabsub.zip").entries for v in "12")
     assert (one.steps, one.score, two.steps, two.score) == (12, scores[1], 6, scores[2])
     assert np.array_equal(one.actions, PLANS[1]) and np.array_equal(two.actions, PLANS[2])

@@ -71,7 +71,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         return load_config([*words, *less], config_dir)
 
     def kept(scenes: Sequence[Any], terms: Sequence[Any], **options: Any) -> plab.sim.Simulator:
-        key = repr((scenes, [term.name for term in terms]))
+        key = repr((scenes, [term.name for term in terms], sorted(options.items())))
         return CACHE.get(key, lambda: build(scenes, terms=terms, **options), check=build.state)
 
     build = plab.sim.Simulator
@@ -95,11 +95,24 @@ def test_quick_start_and_readme(page, changes):
 
 
 @pytest.mark.usefixtures("small")
+def test_paper():
+    """Each experiment, with a few steps of training."""
+    fewer = [(f"range({many})", f"range({few})") for many, few in ((20, 2), (1000, 9), (50, 2))]
+    fewer += [("16, ", "4, "), ("100_000", "200"), ("50_000", "110"), ('"scenes": 8', '"scenes": 2')]
+    plan = '"method.window=50", "method.execute=50", "method.planner.iterations=1"'
+    fewer.append(('"method.window=20", "method.execute=5"', plan))
+    names = run_page("paper.md", *fewer)
+    assert names["agent"].num_timesteps == names["robust"].num_timesteps == 200
+    assert names["learner"].num_timesteps == 110 and names["loss"].item() < 0.5
+    assert 100.0 < names["guess"].exp().item() < 130.0 and 0.0 <= names["score"] <= 1.0
+
+
+@pytest.mark.usefixtures("small")
 def test_environments():
     """With one update of the agent."""
     names = run_page("environments.md", *FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200"))
     assert names["info"]["score"] >= 0.0
-    assert names["infos"]["final_info"]["score"].shape == (4,)
+    assert names["infos"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
     assert names["done"].reward.shape == (4,) and names["done"].truncated.all()
 

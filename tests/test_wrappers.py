@@ -94,7 +94,7 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
     env = plab.make_vec("Move", num_envs=2, overrides=COARSE, success_score=0.0, terminate_on_success=True)
     env.reset()
     _, _, terminated, truncated, info = env.step(np.zeros((2, 6)))
-    assert terminated.all() and not truncated.any() and info["final_info"]["success"].all()
+    assert terminated.all() and not truncated.any() and info["success"].all()
     env.close()
     assert alone[0].reset()[1]["success"] is False
     assert alone[0].spec.max_episode_steps == HORIZON

@@ -1,4 +1,4 @@
-"""Benchmarks of speed, accuracy and stability; each module has its own command line."""
+"""Benchmarks of speed, accuracy, stability and of policies; each module has its own command line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from plab.errors import ArgumentError, pick
 
 __all__ = ["BENCHMARKS", "main"]
 
-BENCHMARKS = ("speed", "accuracy", "stability")
+BENCHMARKS = ("speed", "accuracy", "stability", "unseen")
 
 
 @command_line

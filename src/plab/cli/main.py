@@ -11,7 +11,7 @@ plab demonstrations                       best known actions of the suite
 plab dataset task=Move                    demonstrations as datasets in Minari's format
 plab targets                              targets of tasks
 plab submit, verify, leaderboard          results to publish, and tables of them
-plab bench speed                          benchmarks of speed, accuracy and stability
+plab bench speed                          benchmarks of speed, accuracy, stability, policies
 
 Each has a --help of its own.
 """

@@ -24,6 +24,9 @@ from plab.errors import PlabError
 
 __all__ = ["DatasetError", "Episode", "metadata_of", "read_episodes", "write_dataset"]
 
+EXAMPLE = Path(__file__).parent / "dataset"
+"""The dataset ``example``: ``plab dataset task=Move observe_particles=20``."""
+
 VERSION = "0.5.4"
 """Version of Minari's format."""
 
@@ -149,13 +152,14 @@ def _described(space: Space[Any]) -> dict[str, Any]:
 
 
 def metadata_of(path: str | Path) -> dict[str, Any]:
-    """Return the metadata of a dataset, a folder with the folder ``data`` or that folder itself; with
-    ``path``, the latter.
+    """Return the metadata of a dataset, a folder with the folder ``data`` or that folder itself, or
+    ``example``; with ``path``, the folder of its files.
 
     Raises:
         DatasetError: If there is none.
     """
-    for place in (Path(path).expanduser() / "data", Path(path).expanduser()):
+    path = EXAMPLE if str(path) == "example" else Path(path).expanduser()
+    for place in (path / "data", path):
         if (file := place / "metadata.json").is_file():
             try:
                 return json.loads(file.read_text(encoding="utf-8")) | {"path": place}

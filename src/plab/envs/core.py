@@ -236,6 +236,7 @@ class EpisodeBatch:
         draws: Randomisation of the episodes.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
+        changed_by_hand: Whether the simulator was given other scenes, materials, targets or initial states.
         listener: Called with the actions and the result of each step; None if nothing listens.
     """
 
@@ -350,6 +351,7 @@ class EpisodeBatch:
 
     def _begin(self) -> None:
         """Observe the initial states; no episode has started."""
+        self.changed_by_hand = False
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
             self.problem.refresh()
@@ -425,6 +427,7 @@ class EpisodeBatch:
         """
         if self._simulator.changes != self._changes:
             # The caller has changed scenes, targets or initial states.
+            self.changed_by_hand = True
             self.problem.refresh()
             self._observer = Observer(self.problem, self.configs[0])
             self._sensors.refresh()
@@ -534,8 +537,8 @@ class EpisodeBatch:
         stages.note(_on_host(info["score"]))
         reached = _on_host(info["score"]) >= self._success_score
         reached[list(self._failures)] = False
-        rows = np.flatnonzero(reached & ~stages.last)
-        if rows.size:
+        rows = np.flatnonzero(reached & ~stages.last).tolist()
+        if rows:
             stages.earned[rows] = _on_host(reward)[rows]
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
             terms, iou, *others = self._measured(like)
@@ -755,7 +758,17 @@ class Restorable:
     _arguments: dict[str, Any]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, state and random numbers."""
+        """Return arguments, state and random numbers.
+
+        Raises:
+            TypeError: If the simulator is not as the arguments would make it.
+        """
+        batch = self.batch
+        if batch.changed_by_hand or batch.problem.simulator.changes != batch._changes:
+            raise TypeError(
+                "an environment whose simulator was changed (set_scenes, set_material, set_target or "
+                "set_initial_state) cannot be copied"
+            )
         return {
             "arguments": self._arguments,
             "state": self.batch.get_state(),

@@ -30,7 +30,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = METADATA | {  # type: ignore[misc]
-        "autoreset_mode": AutoresetMode.SAME_STEP
+        "autoreset_mode": AutoresetMode.NEXT_STEP
     }
 
     def __init__(
@@ -40,7 +40,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         task: str,
         variant: str = "1",
         render_mode: str | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
         """Build the environments.
@@ -50,10 +50,10 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             task: Name of the task.
             variant: Name of its variant.
             render_mode: ``rgb_array``, or None for no pictures.
-            autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``SameStep`` resets in the
-                last step of an episode, with the final observation in ``infos["final_obs"]``; ``NextStep`` in
-                the next step, which ignores the action; ``Disabled`` requires :meth:`reset` with
-                ``options={"reset_mask": ...}``.
+            autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``NextStep`` resets in the
+                step after the end of an episode, which ignores the action; ``SameStep`` in the step that ends
+                it, whose last observation is in ``infos["final_obs"]``; ``Disabled`` requires
+                :meth:`reset` with ``options={"reset_mask": ...}``.
             **options: Arguments of :func:`plab.envs.core.make_batch` and
                 :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and
                 ``overrides_per_env``.
