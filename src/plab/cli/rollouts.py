@@ -20,17 +20,12 @@ from plab.cli.command import (
 )
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
-from plab.config.run import RUN_ONLY_KEYS
 from plab.config.suite import EXTENSION_TASKS
-from plab.config.words import require_effect
 from plab.errors import ArgumentError
 from plab.render.graphics import RenderError, require_graphics, require_packages
 
 if TYPE_CHECKING:
     from plab.config import Config
-
-KEYS_WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *RUN_ONLY_KEYS)
-"""Configuration keys without effect on pictures."""
 
 _FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
 """Pixels of a film's frame, of a cell of the contact sheet, and of a frame of the film strip."""
@@ -220,7 +215,6 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         place = Path() if split_archive(options.result) else options.result.parent
         usual = place / (options.result.stem + ending)
     elif words:
-        require_effect(words, KEYS_WITHOUT_EFFECT, "a picture")
         options.result = None
         cfg = options.config = load_config(words, options.config_dir)
         check_sources(cfg)
@@ -254,7 +248,6 @@ def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
 
 def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
     """Refuse results, and words that begin like one of ``own``, for a picture of all tasks."""
-    require_effect([word for word in options.what if "=" in word], KEYS_WITHOUT_EFFECT, "a picture")
     unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
     if unwanted or (options.output and not getattr(options, "gallery", False)):
         raise ArgumentError(f"all tasks are shown: leave out '{(*unwanted, '--output')[0]}'")

@@ -39,11 +39,7 @@ def main(argv: Sequence[str]) -> int:
         print((full_help_text if options.help_all else help_text)(config_dir))
         return 0
     check_overrides(words, config_dir)
-    if options.package and not options.cfg:
-        raise ConfigError("--package has no effect without --cfg: write --cfg job --package sim")
     if options.cfg:
-        if options.multirun:
-            raise ConfigError("--cfg shows one configuration: leave out -m")
         _print_configuration(options, words)
         return 0
     try:

@@ -14,9 +14,7 @@ from plab.cli.command import Parser, command_line, task_list, to_write
 from plab.cli.tables import print_table, write_csv
 from plab.config import Config, build_scene, load_config
 from plab.config.compose import check_sources
-from plab.config.run import RUN_ONLY_KEYS
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.config.words import require_effect
 from plab.demonstrations import known_actions
 from plab.files import cache_dir
 from plab.objective import Scores, mass_change, target_sdf
@@ -25,17 +23,14 @@ from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
 
 
-def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str) -> Namespace:
-    """Add the shared arguments, parse, and reject overrides without effect on ``what``."""
+def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
+    """Add the shared arguments, and parse."""
     add = parser.add_argument
     add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     add("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     options = parser.parse_intermixed_args(argv)
-    if wrong := [word for word in options.overrides if "=" not in word]:
-        parser.error(f"'{wrong[0]}' is no override: write key=value")
     if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
         parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
-    require_effect(options.overrides, idle, what)
     return options
 
 
@@ -69,7 +64,7 @@ def demonstrations(argv: Sequence[str]) -> None:
     Overrides of the configuration, such as sim.device=cuda, may follow.
     """
     parser = Parser("plab demonstrations", demonstrations.__doc__)
-    options = _options(parser, argv, ("method", "seed", *RUN_ONLY_KEYS), "demonstrations")
+    options = _options(parser, argv)
     tasks = [variants(task, options.overrides) for task in options.task]
     replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
     rows = [_row(item) for item in replays]
@@ -119,7 +114,7 @@ def targets(argv: Sequence[str]) -> None:
     parser = Parser("plab targets", targets.__doc__)
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
     parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
-    options = _options(parser, argv, ("method", "seed", "sim.memory_mb", *RUN_ONLY_KEYS), "targets")
+    options = _options(parser, argv)
     if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
         parser.error("--rebuild has no effect with targets.source: leave one of them out")
     table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])

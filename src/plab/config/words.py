@@ -114,13 +114,6 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
     return changes
 
 
-def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None:
-    """Raise ConfigError for an override of a key or section without effect on ``what``."""
-    for override in parse(prepared(words)):
-        if any(f"{override.key_or_group}.".startswith(f"{one}.") for one in idle):
-            raise ConfigError(f"'{override.input_line}' has no effect on {what}: leave it out")
-
-
 # ---------------------------------------------------------------------------------------------- explanations
 
 COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
