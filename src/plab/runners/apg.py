@@ -43,11 +43,6 @@ class ApgConfig(MethodConfig):
 class ApgRunner(Runner):
     """Runner of a policy network; each iteration is an episode with gradient."""
 
-    @property
-    def method(self) -> ApgConfig:
-        """The section ``method`` of the run, which is alone."""
-        return self.tracks[0].cfg.method_as(ApgConfig)
-
     def context(self) -> AbstractContextManager[Any]:
         return torch_settings(self.method.torch_threads)
 

@@ -73,7 +73,7 @@ class IdentifyRunner(Runner):
         from plab.demonstrations.minari import read_episodes
 
         (track,) = self.tracks
-        self._method = method = track.cfg.method_as(IdentifyConfig)
+        method = self.method
         self.problem = shared_problem(self.cache, [track.cfg] * (2 * len(method.parameters) + 1))
         scene, episodes = self.problem.scenes[0], list(read_episodes(method.dataset, method.episode + 1))
         if method.episode >= len(episodes):
@@ -99,19 +99,19 @@ class IdentifyRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Start from the configuration's parameters, or resume from the file."""
-        first = [_value(self.problem.scenes[0], name) for name in self._method.parameters]
+        first = [_value(self.problem.scenes[0], name) for name in self.method.parameters]
         if min(first) <= 0.0:
             raise ConfigError("parameters that are fitted must be positive at first")
         logs = np.log(first)
         nothing = np.zeros((len(logs), len(logs))), np.zeros(len(logs))
-        begin = {"trial": logs, "best": logs, "cost": np.inf, "damping": self._method.damping}
+        begin = {"trial": logs, "best": logs, "cost": np.inf, "damping": self.method.damping}
         self._state: dict[str, Any] = begin | dict(zip(("curvature", "slope"), nothing, strict=True))
         if state is not None:
             self._state = {name: np.array(value) for name, value in state.items()}
 
     def step(self, track: Track) -> Step:
         """Simulate the trial and its perturbations, accept it if it fits better, and compute the next one."""
-        begin, method, state = time.perf_counter(), self._method, self._state
+        begin, method, state = time.perf_counter(), self.method, self._state
         changes = np.eye(len(method.parameters)) * method.difference
         trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
         positions, measured = self._simulate(np.exp(trials))
@@ -148,7 +148,7 @@ class IdentifyRunner(Runner):
 
     def tell(self, rows: Any, tracks: Any) -> None:
         """Report the fit."""
-        texts = [f"{n} {rows[0][n]:.4g} ± {rows[0][f'{n}_deviation']:.2g}" for n in self._method.parameters]
+        texts = [f"{n} {rows[0][n]:.4g} ± {rows[0][f'{n}_deviation']:.2g}" for n in self.method.parameters]
         self.report(self.tracks[0].iteration, f"misfit {rows[0]['misfit']:.3g}, {', '.join(texts)}")
 
     def _simulate(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
@@ -156,7 +156,7 @@ class IdentifyRunner(Runner):
         [environment, parameter], and the measures of the first episode."""
         problem, simulator = self.problem, self.problem.simulator
         scene = problem.scenes[0]
-        simulator.set_scenes([_changed(scene, self._method.parameters, own) for own in values])
+        simulator.set_scenes([_changed(scene, self.method.parameters, own) for own in values])
         simulator.set_contact("hard")
         first, terms, positions = problem.loss_of(simulator.measure().terms)[0], [], []
         for action in self._actions:

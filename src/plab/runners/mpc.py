@@ -118,7 +118,6 @@ class MpcRunner(PlannerRunner):
         super().build()
         self._beginning = self._current_state()
         (self._track,) = self.tracks
-        self._method = self._track.cfg.method_as(MpcConfig)
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Begin the episode, or repeat the steps in the file."""
@@ -134,14 +133,14 @@ class MpcRunner(PlannerRunner):
 
     def iterations(self, track: Track) -> int:
         """Return the number of plans per episode."""
-        return math.ceil(track.cfg.sim.horizon / self._method.execute)
+        return math.ceil(track.cfg.sim.horizon / self.method.execute)
 
     def has_more(self, track: Track) -> bool:
         return track.iteration < self.iterations(track)
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
-        begin, track, method = time.perf_counter(), self._track, self._method
+        begin, track, method = time.perf_counter(), self._track, self.method
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)
         kind = Replanning if taken else CandidateStart

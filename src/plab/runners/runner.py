@@ -138,6 +138,11 @@ class Runner:
 
     # ------------------------------------------------------------------------------------ for use in hooks
 
+    @property
+    def method(self) -> Any:
+        """The section ``method`` of the first run, which those that train in step have in common."""
+        return self.tracks[0].cfg.method
+
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
         """Attribute the wall time from now on to another phase, and to other runs if given; an empty phase is
         not counted."""

@@ -233,11 +233,6 @@ class PolicyRunner(Runner):
     _pace = 0.0
     _shown = ""
 
-    @property
-    def method(self) -> Any:
-        """The common section ``method`` of the runs."""
-        return self.tracks[0].cfg.method
-
     def context(self) -> AbstractContextManager[Any]:
         return torch_settings(self.method.torch_threads)
 

@@ -188,52 +188,43 @@ class Finalists:
     score there, and of several the ones of lowest loss.
 
     Attributes:
+        highest: Actions of the highest score since the last check, if there were any.
+        lowest: Actions of the lowest loss.
         kept_score: Score of the actions that are kept, in the hard contact model; NaN before the first check.
     """
 
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._named: dict[str, Finalist] = {}
-        self.kept_score, self._kept_loss = np.nan, np.nan
-
-    @property
-    def highest(self) -> Finalist:
-        """Actions of the highest score since the last check."""
-        return self._named["highest"]
-
-    @property
-    def lowest(self) -> Finalist:
-        """Actions of the lowest loss."""
-        return self._named["lowest"]
+    highest: Finalist
+    lowest: Finalist
+    kept_score = _kept_loss = float("nan")
 
     def add(self, actions: np.ndarray, iteration: int, row: Mapping[str, float]) -> None:
         """Consider the actions of an iteration."""
         new = Finalist(actions.copy(), iteration, row["loss"], row["score"])
-        ranks = {"highest": lambda one: (-one.score, one.loss), "lowest": lambda one: one.loss}
-        for name, rank in ranks.items():
-            if name not in self._named or rank(new) < rank(self._named[name]):
-                self._named[name] = new
+        highest, lowest = getattr(self, "highest", new), getattr(self, "lowest", new)
+        self.highest = min(highest, new, key=lambda one: (-one.score, one.loss))
+        self.lowest = min(lowest, new, key=lambda one: one.loss)
 
     def keep_best(self) -> Finalist | None:
-        """Return the checked finalist if it is better than the kept one, and reset the highest score."""
+        """Return the checked finalist that is better than what is kept, if any, and forget the highest."""
         best = None
-        for one in (self._named.pop("highest"), self._named["lowest"]):
+        for one in (self.highest, self.lowest):
             better = not one.hard_score <= self.kept_score or (
                 one.hard_score == self.kept_score and one.loss < self._kept_loss
             )
             if one.hard_score >= 0.0 and better:
                 best, self.kept_score, self._kept_loss = one, one.hard_score, one.loss
+        del self.highest
         return best
 
     def state(self) -> dict[str, Any]:
         """Return everything as arrays and numbers."""
-        named = {name: vars(one) for name, one in self._named.items()}
+        named = {name: vars(one) for name, one in vars(self).items() if isinstance(one, Finalist)}
         return named | {"kept_score": self.kept_score, "kept_loss": self._kept_loss}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to a :meth:`state`."""
         for name in {"highest", "lowest"} & state.keys():
-            self._named[name] = Finalist(**state[name])
+            setattr(self, name, Finalist(**state[name]))
         self.kept_score, self._kept_loss = (float(state.get(f"kept_{n}", np.nan)) for n in ("score", "loss"))
 
 
