@@ -1,4 +1,4 @@
-"""Errors for mistakes that the user can put right, and their messages."""
+"""Errors for invalid input, and their messages."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 TRACEBACK = "PLAB_TRACEBACK"
-"""Environment variable that shows bugs with their tracebacks."""
+"""Environment variable that enables tracebacks of bugs."""
 
 
 class PlabError(Exception):
-    """A mistake that the user can put right; the message is one line with the remedy.
+    """Invalid input; the message is one line with the remedy.
 
     Attributes:
         exit_code: Exit code of a command that raises it.
@@ -22,17 +22,17 @@ class PlabError(Exception):
     exit_code = 2
 
     def __str__(self) -> str:
-        """Return the message, shortened if it quotes something very long."""
+        """Return the message, shortened if it contains a very long quote."""
         text = super().__str__()
         return text if len(text) < 1900 else f"{text[:950]} ... {text[-900:]}"
 
 
 class ArgumentError(PlabError, ValueError):
-    """An argument, from Python or on a command line, that does not fit."""
+    """An invalid argument, from Python or on a command line."""
 
 
 class ConfigError(PlabError, ValueError):
-    """A configuration that cannot run; the message is one line with the problem and the remedy."""
+    """An invalid configuration; the message is one line with the problem and the remedy."""
 
 
 def pick(name: str, names: Sequence[str]) -> str:
@@ -43,13 +43,13 @@ def pick(name: str, names: Sequence[str]) -> str:
 
 
 def tell(message: str) -> None:
-    """Print a line on standard error, the form of all mistakes and warnings."""
+    """Print a line on standard error, for all errors and warnings."""
     with suppress(BrokenPipeError):
         print(f"plab: {' '.join(message.split())}", file=sys.stderr)
 
 
 def out_of_memory(error: MemoryError) -> str:
-    """Return one line about lacking memory; Python's own error is empty."""
+    """Return a one-line message about insufficient memory; Python's own error is empty."""
     return str(error) or "this computer has too little memory for that: close something, or ask for less"
 
 

@@ -1,6 +1,6 @@
-"""Files of other people and other programs: archives, NumPy arrays and shapes; and plab's cache folder.
+"""Untrusted files: archives, NumPy arrays and shapes; and plab's cache folder.
 
-Files are read as data: nothing is unpickled, extracted or executed, and no file unpacks to more than a limit.
+Files are read as data: nothing is unpickled, extracted or executed, and unpacked sizes are limited.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _RATIO, _SMALL = 200, 1 << 24
 """Largest ratio of unpacked to packed size, for results above a size [B]. Deflate reaches 1,032."""
 
 _UNPACKING_MEMORY = 1 << 28
-"""Most memory that xz may take besides its result [B]; plab's own archives need a quarter."""
+"""Maximum working memory of xz [B]; plab's own archives need a quarter."""
 
 _LONGEST_HEADER = 4096
 """Longest header of an array [B]; NumPy's own take 128."""
@@ -43,7 +43,7 @@ class UnreadableError(ValueError):
 
 
 class ShapeError(PlabError, ValueError):
-    """A mesh, point cloud or mass tensor that cannot be used; the message names the file and the reason."""
+    """A mesh, point cloud or mass tensor is invalid; the message names the file and the reason."""
 
 
 def cache_dir() -> Path:
@@ -62,11 +62,11 @@ def one_line(error: BaseException) -> str:
 
 
 def regular_file(path: Path) -> os.stat_result:
-    """Return the state of a regular file: opening a pipe or a device could wait forever.
+    """Return the status of a regular file, because opening a pipe or a device could block.
 
     Raises:
         UnreadableError: If it is a folder, pipe or device.
-        OSError: If there is nothing, or permission is denied.
+        OSError: If it does not exist, or permission is denied.
     """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
@@ -84,9 +84,9 @@ def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]
     The last unpacked archive is kept in memory.
 
     Raises:
-        UnreadableError: If a member leads out of the folder, occurs twice or overlaps another, or the archive
-            would unpack to more than a limit.
-        ValueError: If it is no zip file, or damaged.
+        UnreadableError: If a member leads outside the folder, occurs twice or overlaps another, or the
+            archive exceeds a size limit.
+        ValueError: If it is not a zip file, or damaged.
         OSError: If it cannot be opened.
     """
     found = regular_file(path)
@@ -103,7 +103,7 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     """Return the content of a member of an archive.
 
     Raises:
-        UnreadableError: If it would unpack to more than a limit.
+        UnreadableError: If it exceeds a size limit.
         ValueError: If it is damaged or encrypted.
         KeyError: If there is none of this name.
     """
@@ -118,7 +118,7 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Turn errors of a library's parser, which answers damage with whatever it meets, into a ValueError."""
+    """Convert arbitrary errors of a library's parser to ValueError."""
     try:
         yield
     except (UnreadableError, OSError, MemoryError):
@@ -129,7 +129,7 @@ def _damage() -> Iterator[None]:
 
 @functools.lru_cache(maxsize=1)
 def _unpacked(path: Path, size: int, *_: int) -> bytes:
-    """Return the content of an xz file; the other arguments identify its version."""
+    """Return the content of an xz file, cached by the other arguments, which identify its version."""
     most = min(LARGEST, max(_SMALL, _RATIO * size))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING_MEMORY)
     with _damage():
@@ -151,7 +151,7 @@ def _check_members(archive: zipfile.ZipFile, size: int) -> None:
         if info.filename in seen:
             raise UnreadableError(f"it has two members {name!r}")
         seen.add(info.filename)
-        # Other methods unpack a whole member before its size is known.
+        # Other compression methods unpack a whole member before its size is known.
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise UnreadableError(f"its member {name!r} is compressed in a way that plab does not write")
     if sum(info.compress_size for info in archive.infolist()) > size:
@@ -165,7 +165,7 @@ def read_array(path: Path) -> np.ndarray:
     """Return the array of a ``.npy`` file.
 
     Raises:
-        UnreadableError: If it is no such file, cut short, or holds anything but numbers and text.
+        UnreadableError: If it is not such a file, truncated, or contains other data than numbers and text.
         OSError: If it cannot be opened.
     """
     regular_file(path)
@@ -177,7 +177,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by their names.
 
     Raises:
-        UnreadableError: If it holds anything but numbers and text.
+        UnreadableError: If it contains other data than numbers and text.
         ValueError: If it is no such file, or damaged.
         OSError: If it cannot be opened.
     """
@@ -209,16 +209,16 @@ def _array(file: BinaryIO) -> np.ndarray:
 
 
 def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
-    """Find a file of a shape, and return its place and the SHA-256 of its content.
+    """Find a shape file, and return its path and the SHA-256 of its content.
 
     Args:
-        file: The file. A relative one is looked for in the working directory, then where modules of the
-            user's own are: in the config folder and in the folder above it. An absolute one that is not there
-            is looked for by its name in the same places if its SHA-256 is known.
-        sha256: SHA-256 that the content must have; None for any content.
+        file: The file. A relative path is searched for in the working directory, then in the config folder
+            and its parent folder. A missing absolute path is searched for by file name in the same places if
+            its SHA-256 is known.
+        sha256: Expected SHA-256 of the content; None for any content.
 
     Raises:
-        ShapeError: If there is no such file, it cannot be read, or its content is another.
+        ShapeError: If the file is missing, unreadable, or has another checksum.
     """
     path = Path(file)
     folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
@@ -231,7 +231,7 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
             f"there is no file {file}: put it there, into the working directory, into the config folder or "
             "into the folder above it"
         )
-    # Not resolved: the target of a link may have another ending.
+    # Not resolved, because the target of a link may have another suffix.
     path = found.absolute()
     try:
         if regular_file(path).st_size > _LARGEST_SHAPE:

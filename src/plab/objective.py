@@ -1,7 +1,7 @@
 """Mass tensors, distances to a target, losses, rewards, soft IoU and scores.
 
-Plain NumPy in float64: the final evaluation and the tests use it; the simulator computes the same loss terms
-on its own grid, where their gradient is needed.
+Plain NumPy in float64, for the final evaluation and the tests; the simulator computes the same loss terms
+with gradients.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TARGET_ENTRIES = 14
 """Length of :func:`target_observation`."""
 
 SMOOTHING = 1 / 32
-"""Standard deviation of the Gaussian by which :func:`mass_change` smooths [domain units]."""
+"""Standard deviation of the Gaussian smoothing in :func:`mass_change` [domain units]."""
 
 TRANSPORT_PORTIONS = 512
 """Number of portions of mass in :func:`earth_movers_distance`."""
@@ -64,7 +64,7 @@ class Scores:
     Attributes:
         iou_initial: Soft IoU of the initial mass tensor and the target.
         iou_final: Soft IoU of the final mass tensor and the target.
-        iou_target_self: Soft IoU of the target and itself, well below 1: the most that can be reached.
+        iou_target_self: Soft IoU of the target with itself, well below 1: the upper bound.
         score_printed: The paper's printed formula ``(iou_final - iou_initial) / (1 - iou_initial)``.
         score: Score of the paper's tables: ``(iou_final - iou_initial) / (iou_target_self - iou_initial)``,
             clamped to [0, 1].
@@ -80,15 +80,15 @@ class Scores:
 def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") -> np.ndarray:
     """Spread particles of equal mass over the grid with the quadratic B-spline.
 
-    Node i is at i / n. A particle within half a cell of a lower face also reaches the ghost node at -1; that
-    share goes to node 0, so that no mass is lost.
+    Node i is at i / n. A particle within half a cell of a lower face also contributes to the ghost node at
+    -1; this mass is added to node 0, so that none is lost.
 
     Args:
         x: Particle positions [domain units], shape [particle, 3].
         n: Grid nodes per axis.
         mass: Mass per particle.
-        floor_stencil: Convention for such particles, as in :class:`plab.scenes.Scene`. With ``release``, they
-            have negative weights instead of a ghost node.
+        floor_stencil: Convention for these particles, as in :class:`plab.scenes.Scene`. With ``release``,
+            they have negative weights instead of a ghost node.
 
     Returns:
         Mass tensor, shape [n, n, n], float64.
@@ -100,7 +100,8 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
     if x.ndim != 2 or x.shape[1] != 3:
         raise ArgumentError(f"positions have shape {list(x.shape)}, not [particle, 3]")
     scaled = x * n
-    # Written so that NaN fails it, too. Beyond these limits a particle reaches nodes below -1 or above n - 1.
+    # Written so that NaN fails it, too. Outside these limits a particle contributes to nodes below -1 or
+    # above n - 1.
     if not np.all((scaled >= -0.5) & (scaled < n - 1.5)):
         raise ArgumentError(
             f"positions outside the grid: each coordinate must be in [{-0.5 / n:.4g}, {1 - 1.5 / n:.4g})"
@@ -129,7 +130,7 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
         Distance [domain units], shape [n, n, n]; 0 on the target's nodes.
 
     Raises:
-        ValueError: If no node holds more than the threshold.
+        ValueError: If no node exceeds the threshold.
     """
     # Imported here: SciPy's start-up would be paid by every `--help`.
     from scipy.ndimage import distance_transform_edt
@@ -155,7 +156,7 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
         binary.
 
     Raises:
-        ValueError: If the shapes differ or a tensor holds no mass.
+        ValueError: If the shapes differ or a tensor has no mass.
     """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if a.shape != b.shape:
@@ -177,7 +178,7 @@ def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
     Sum of the mean distances from the mass of each tensor to the nearest node of the other. Distances below a
     cell are not resolved.
     """
-    # The release's stencil makes a few masses negative.
+    # A few masses are negative with the release's stencil.
     a, b = (np.asarray(mass, np.float64).clip(0.0) for mass in (a, b))
     away = [target_sdf(mass, min(TARGET_MASS, 0.5 * mass.max())) for mass in (b, a)]
     return float((a * away[0]).sum() / a.sum() + (b * away[1]).sum() / b.sum())
@@ -210,7 +211,7 @@ def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PO
 def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
     """Return the centroids of portions of equal mass, shape [count, 3]."""
     node = np.argwhere(mass > 0.0)
-    # Morton's order: the bits of the three indices in turn.
+    # Morton order: interleaved bits of the three indices.
     bits = (node[:, :, None] >> np.arange(mass.shape[0].bit_length())) & 1
     code = (bits << (3 * np.arange(bits.shape[2]) + np.arange(3)[:, None])).sum(axis=(1, 2))
     node = node[code.argsort()]
@@ -239,8 +240,8 @@ def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
 def scores_from_iou(start: float, end: float, best: float) -> Scores:
     """Score an episode by soft IoUs with its target.
 
-    Where the initial shape is as good as the target itself, so that nothing can be gained and the formulas
-    divide by zero, a score is 1 if the final shape is still as good, and 0 otherwise.
+    If the initial shape has the IoU of the target itself, so that the formulas divide by zero, the score is 1
+    if the final shape has it, too, and 0 otherwise.
 
     Args:
         start: Soft IoU of the initial mass tensor.
@@ -264,13 +265,13 @@ def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
     start = np.broadcast_to(np.asarray(start, np.float64), (2, np.size(start)))
     best = np.stack([np.asarray(best, np.float64), np.ones_like(start[0])])
     nothing_to_gain = best - start <= 1e-12
-    # Division by infinity makes the share 0; batch_scores adds 0 or 1 to it.
+    # Division by infinity gives 0, to which batch_scores adds 0 or 1.
     way = np.where(nothing_to_gain, np.inf, best - start)
     return np.stack([start, way, best - 1e-12, nothing_to_gain])
 
 
 def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
-    """Score many episodes as :func:`scores_from_iou` scores one.
+    """Score many episodes as :func:`scores_from_iou`.
 
     Args:
         scale: From :func:`score_scale`, an array or a tensor like ``end``.
@@ -285,8 +286,8 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
 
 
 def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return where mass has to arrive (above 0) and to leave (below), by node, as shares of all mass, shape
-    [n, n, n]. Both mass tensors are normalised and smoothed: they are of particles drawn at random."""
+    """Return missing (positive) and excess (negative) mass by node, as fractions of all mass, shape [n, n,
+    n]. Both mass tensors are normalised and smoothed, because particles are sampled at random."""
     # Imported here: SciPy's start-up would be paid by every `--help`.
     from scipy.ndimage import gaussian_filter
 
@@ -295,7 +296,7 @@ def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Describe a target for an observation: where mass has to leave, and where it has to arrive.
+    """Describe a target for an observation by its excess and missing mass.
 
     Args:
         start: Mass tensor of the initial state, shape [n, n, n].
@@ -318,7 +319,7 @@ def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def total_loss(terms: Any, weights: Any) -> Any:
-    """Weigh and add the terms of the step loss.
+    """Return the weighted sum of the loss terms of a step.
 
     Args:
         terms: Unweighted terms, shape [..., term]; an array or a tensor.
@@ -327,7 +328,7 @@ def total_loss(terms: Any, weights: Any) -> Any:
     Returns:
         Loss, shape [...], like ``terms``.
     """
-    # No matrix product: its rounding depends on how many losses are computed at once.
+    # Not a matrix product, whose rounding depends on the number of losses.
     return (terms * weights).sum(-1)
 
 
@@ -365,7 +366,7 @@ def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None 
     """Return the class, ``module:Class``, of each weight's term; nothing is imported.
 
     Raises:
-        ConfigError: If a name stands for no term, or a choice for no weight.
+        ConfigError: If a name is not a term, or a choice has no weight.
     """
     chosen = _DEFAULT_TERMS | dict(choices or {})
     for name in choices or {}:

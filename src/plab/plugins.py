@@ -1,7 +1,7 @@
-"""Objects that a configuration names as ``module:NAME``, plab's own and those of files outside it.
+"""Objects named as ``module:NAME`` in a configuration, in plab or in external files.
 
 Modules are searched for in Python's path, then in the config folder (``--config-dir``) and its parent folder.
-Results record the text alone, which is the same on every computer.
+Results record only the text, which does not depend on the computer.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Kind = TypeVar("Kind")
 
 
 class LazyModule(ModuleType):
-    """A module that is imported when one of its names is first used."""
+    """A module that is imported on first access to an attribute."""
 
     def __getattr__(self, name: str) -> Any:
         """Import the module, and cache the object."""
@@ -53,9 +53,9 @@ class Registry(UserDict[str, Any]):
 
 
 def search_in(config_dir: str | Path) -> None:
-    """Let modules be found in a config folder and in the one above it, too, for the rest of the process."""
+    """Add a config folder and its parent folder to the module path for the rest of the process."""
     folder = Path(config_dir).resolve()
-    # Last, so that nothing of Python's or plab's is hidden by a file of the user's.
+    # At the end, so that user files do not hide modules of Python or plab.
     sys.path += [path for path in (str(folder), str(folder.parent)) if path not in sys.path]
 
 
@@ -76,11 +76,11 @@ def exported_module_path() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return the object that a text names as ``module:NAME``, an instance of ``kind`` (``type`` for classes).
+    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes).
 
     Raises:
-        plab.config.ConfigError: If the text is no such text, there is no such module or name, the module
-            cannot be imported, or the object is of another kind; one line.
+        plab.config.ConfigError: If the text is malformed, the module or name does not exist, the module
+            cannot be imported, or the object is of another kind.
     """
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):

@@ -1,7 +1,7 @@
 """Problems: scenes, targets, simulator and objective of a batch of configurations.
 
-Runners and environments start here. All configurations of a batch share the kind of scene (numbers of
-particles and manipulators, grid); variants of one task do.
+Runners and environments start here. All configurations of a batch must have the same kind of scene (numbers
+of particles and manipulators, grid), as variants of one task do.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Episodes:
         reward: Rewards, shape [batch, T].
         iou: Soft IoU with the target after each step, shape [batch, T].
         final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
-        scores: How close each environment came.
+        scores: Scores of each environment.
         gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
         failures: Environments that broke off, with time and reason; their numbers mean nothing.
     """
@@ -71,7 +71,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class BatchMeasures:
-    """Totals of many sequences of actions; arrays, or CUDA tensors if the actions were one.
+    """Measures of many action sequences, as arrays or, like the actions, CUDA tensors.
 
     Attributes:
         measures: Measures of the episodes, shape [batch] each: ``loss`` and its terms, ``reward``, ``iou``
@@ -88,7 +88,7 @@ class BatchMeasures:
 
 
 def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
-    """Build the scene of each configuration, one object where they are alike.
+    """Build the scene of each configuration, with one object for equal scenes.
 
     Raises:
         plab.config.ConfigError: If a variant does not exist.
@@ -100,7 +100,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Return True if a scene and its target fit the grid's domain, which shrinks with coarse nodes."""
+    """Return True if a scene and its target fit into the grid's domain, which is smaller for coarse grids."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):
@@ -111,15 +111,15 @@ def fits(cfg: Config) -> bool:
 def make_simulator(
     cfgs: Config | Sequence[Config], scenes: Sequence[Scene] | None = None, **options: Any
 ) -> Simulator:
-    """Make a simulator with the scenes, loss terms, device, precision and memory of configurations.
+    """Create a simulator with the scenes, loss terms, device, precision and memory budget of configurations.
 
     Args:
-        cfgs: A configuration, or one per environment, alike in ``sim`` and the loss.
-        scenes: Their scenes, where they have been built already.
-        **options: Arguments of :class:`plab.sim.Simulator`, in place of the configuration's.
+        cfgs: A configuration, or one per environment, with equal ``sim`` and loss.
+        scenes: Their scenes, if already built.
+        **options: Arguments of :class:`plab.sim.Simulator` that override the configuration's.
 
     Raises:
-        plab.config.ConfigError: If there is no such term of the loss.
+        plab.config.ConfigError: If a loss term does not exist.
         plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
         plab.sim.DeviceError: If CUDA was asked for and is not there.
     """
@@ -136,7 +136,7 @@ def make_simulator(
 
 
 def kinds_of(cfgs: Sequence[Config]) -> list[str]:
-    """Return texts that are equal for configurations of the same environment: those that differ only in seed,
+    """Return texts that are equal for configurations of the same environment, which differ only in seed,
     files and learning."""
 
     def text(cfg: Config) -> str:
@@ -144,7 +144,7 @@ def kinds_of(cfgs: Sequence[Config]) -> list[str]:
         loss = cfg.method.loss_weights, cfg.method.loss_terms
         return json.dumps([cfg.variant, cfg.seed_particles, *sections, *loss])
 
-    # A planner's batch has each configuration many times.
+    # A planner's batch repeats each configuration.
     texts = {id(cfg): text(cfg) for cfg in {id(cfg): cfg for cfg in cfgs}.values()}
     return [texts[id(cfg)] for cfg in cfgs]
 
@@ -154,23 +154,23 @@ class Problem:
 
     Attributes:
         scenes: One scene per environment.
-        simulator: Their simulator, in its initial state.
-        term_names: Names of the terms of the loss; those of weight 0 are left out.
+        simulator: Simulator, in its initial state.
+        term_names: Names of the loss terms with nonzero weight.
         weights: Their weights, shape [term].
         labels: Labels with units, by column of results.
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
-        initial_scores: How close the initial states are.
+        initial_scores: Scores of the initial states.
     """
 
     def __init__(self, cfgs: Sequence[Config], simulator: Simulator | None = None) -> None:
         """Build everything.
 
         Args:
-            cfgs: One configuration per environment, alike in ``protocol``, ``sim``, ``targets`` and the loss.
+            cfgs: One configuration per environment, with equal ``protocol``, ``sim``, ``targets`` and loss.
             simulator: Existing simulator of the same scenes and loss terms, if any.
 
         Raises:
-            plab.config.ConfigError: If the configurations do not fit together.
+            plab.config.ConfigError: If the configurations are incompatible.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
             plab.sim.DeviceError: If CUDA was asked for and is not there.
@@ -187,12 +187,12 @@ class Problem:
         self.weights = np.array([weights[name] for name in self.term_names])
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
         self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
-        # Distances to equal targets are equal.
+        # Distances are computed once for equal targets.
         distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
         self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
         self.simulator.set_target(self.target_mass, np.stack(self._distances))
         self.simulator.set_weights({name: weights[name] for name in self.term_names})
-        # Making a target leaves another contact model behind than finding it in the cache.
+        # Generating a target changes the contact model, loading it from the cache does not.
         self.simulator.set_contact("soft")
         self._held_weights = Constants(self.weights)
         self.refresh(kinds)
@@ -201,7 +201,7 @@ class Problem:
         """Reset the simulator, and follow changes of its scenes, targets and initial states.
 
         Args:
-            kinds: Texts that are equal for equal environments; all may differ if None.
+            kinds: Texts that are equal for equal environments; default: all may differ.
         """
         self.simulator.reset()
         self.scenes, self._initial_mass = self.simulator.scenes, self.simulator.mass_tensor()
@@ -227,13 +227,12 @@ class Problem:
 
         Args:
             scenes: One scene per environment, of the same kind as before.
-            particles: Initial positions of environments in which they change, [particle, 3] each.
-            targets: Mass tensors of environments in which they change, and the distances to them, shape [n,
-                n, n] each.
+            particles: Initial positions by environment, for those that change, [particle, 3] each.
+            targets: Mass tensors and distances by environment, for those that change, shape [n, n, n] each.
 
         Raises:
             plab.scenes.SceneError: If a scene cannot be simulated; nothing is changed then.
-            ValueError: If positions do not fit; likewise.
+            ValueError: If positions have a wrong shape; likewise.
         """
         simulator = self.simulator
         simulator.change_scenes(scenes, particles)
@@ -250,7 +249,7 @@ class Problem:
                 self.initial_scores[e] = replace(self.initial_scores[e], iou_target_self=best)
 
     def note_starts(self, environments: Sequence[int], iou: np.ndarray) -> None:
-        """Score environments from now on by the soft IoUs of their initial states, shape [batch]."""
+        """Set the soft IoUs of the initial states for scores, shape [batch]."""
         for e in environments:
             start = float(iou[e])
             self.initial_scores[e] = scores_from_iou(start, start, self.initial_scores[e].iou_target_self)
@@ -279,7 +278,7 @@ class Problem:
         self._scale = Constants(score_scale(*zip(*pairs, strict=True)))
 
     def loss_of(self, terms: Any) -> Any:
-        """Weigh and add terms, shape [..., term]; an array or a tensor of shape [...]."""
+        """Return the weighted sum of terms, shape [..., term], as an array or a tensor of shape [...]."""
         return total_loss(terms, self._held_weights.like(terms))
 
     def scores_of(self, iou: Any) -> tuple[Any, Any]:
@@ -306,8 +305,8 @@ class Problem:
         }
 
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
-        """Run actions from the initial states, in the current contact model, and total their measures. CUDA
-        tensors stay on the device, failures excepted.
+        """Simulate actions from the initial states, in the current contact model, and return the measures of
+        the episodes. CUDA tensors stay on the device, except failures.
 
         Args:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
@@ -322,7 +321,7 @@ class Problem:
         loss = self.loss_of(terms)
         reward = rewards(result.initial_terms, terms, self._held_weights.like(terms))
         score, _ = self.scores_of(iou)
-        # cumsum() adds in order; the order of sum() depends on the number of episodes.
+        # cumsum() adds in order, while the order of sum() depends on the number of episodes.
         total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
@@ -331,15 +330,14 @@ class Problem:
     def rollout(
         self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True
     ) -> Episodes:
-        """Run actions from the initial states, in the simulator's current contact model.
+        """Simulate actions from the initial states, in the simulator's current contact model.
 
         Args:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
             gradient: Whether to compute the gradient of the trajectory loss.
             strict: Whether divergence of an environment is an error instead of an entry in ``failures``.
-            exact: Whether to fetch the mass tensors of the last states and to score those, in float64. The
-                simulator's own IoU, which scores are taken from otherwise, agrees to its rounding and takes
-                no time.
+            exact: Whether to fetch the mass tensors of the last states and compute scores from them, in
+                float64. Otherwise scores use the simulator's IoU, which agrees to rounding and has no cost.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -369,7 +367,8 @@ class Problem:
         return scores_from_iou(first.iou_initial, iou, first.iou_target_self)
 
     def _final_scores(self, result: Rollout, final_mass: np.ndarray | None) -> list[Scores]:
-        """Score the last states, by their mass tensors if there are any; those of failures mean nothing."""
+        """Score the last states, from mass tensors if available; scores of diverged environments are
+        meaningless."""
         ious = [float(iou) for iou in result.step_iou[:, -1]]
         for e, own in enumerate(() if final_mass is None else final_mass):
             if e not in result.failures:
@@ -378,7 +377,7 @@ class Problem:
 
 
 def _warn_of_thin(scenes: Sequence[Scene]) -> None:
-    """Log a line for manipulators that fit between the nodes of the grid, on which contact acts."""
+    """Log a warning for manipulators that fit between grid nodes, where contact acts."""
     thin = {
         f"manipulators[{number}] is {2 * min(tool.size):.2g} thin, less than half a cell of the grid, "
         f"{scene.dx / 2:.2g}: it passes through bodies; use a finer grid"
@@ -402,7 +401,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
     """Build the targets of some configurations, or load them from the release's files.
 
     Args:
-        cfgs: One configuration per environment, one object where they are alike.
+        cfgs: One configuration per environment, with one object for equal ones.
         simulator: Simulator of their scenes.
         rebuild: Simulate also cached targets.
 

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar with the time left on a terminal, a line now and then elsewhere."""
+"""Progress of a run: a bar with the remaining time on a terminal, otherwise lines at intervals."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from rich.progress import (
 from rich.table import Column
 
 Report = Callable[[int, str], None]
-"""Function of the number of steps done and a short text about how it goes."""
+"""Function of the number of finished steps and a short status text."""
 
 Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
-"""Context that passes the name of each kernel under compilation to a function, and an empty one afterwards;
+"""Context that reports the name of each kernel being compiled to a function, and an empty name afterwards,
 such as :func:`plab.sim.compiler.watch_compiling`."""
 
 PLAIN_EVERY = 10
-"""Default number of steps between two lines where there is no terminal."""
+"""Default number of steps between lines without a terminal."""
 
 
 @contextmanager
@@ -41,15 +41,15 @@ def show_progress(
     plain_every: int = PLAIN_EVERY,
     compiling: Watcher | None = None,
 ) -> Iterator[Report]:
-    """Show how far a run has come while the ``with`` block lasts.
+    """Show the progress of a run inside the ``with`` block.
 
     Args:
         title: Title of the bar.
         start: Steps done before.
-        total: Steps to do, the ones done before included; None: a terminal alone shows the title.
+        total: Total number of steps, including earlier ones; None: show only the title, on a terminal.
         enabled: Whether to show anything.
-        plain_every: Steps between two lines where there is no terminal.
-        compiling: Watcher of compiled kernels, which are shown on a terminal; None: none are.
+        plain_every: Steps between lines without a terminal.
+        compiling: Watcher of kernel compilation, shown on a terminal; None: none are.
 
     Yields:
         Function to call after every step.
@@ -80,7 +80,7 @@ def show_line(text: str) -> None:
 
 
 def _columns(total: int | None) -> tuple[ProgressColumn, ...]:
-    """Return the parts of the bar; on a narrow terminal the bar itself gives way, then the text."""
+    """Return the parts of the bar; on narrow terminals the bar is dropped first, then the text."""
     title, text = (
         TextColumn(f"{{task.{part}}}", markup=False, table_column=Column(no_wrap=True))
         for part in ("description", "fields[text]")
@@ -104,12 +104,12 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
         nonlocal first, last
         now = time.monotonic()
         if first is None or done == first[1]:
-            # The first step compiles the simulator, which does not count for the pace.
+            # The first step includes compilation and is excluded from the speed.
             first, left = first or (now, done), "started"
         else:
             begin, before = first
             left = f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
-        # A step may be a batch of episodes, that passes a multiple without stopping at it.
+        # A step may be a batch of episodes and skip multiples of the interval.
         if last == start or done // every > last // every or done == total:
             print(f"{title} {done}/{total}, {left}, {text}", flush=True)
         last = done

@@ -106,7 +106,7 @@ class Plan:
     device: str = "cpu"
 
     def settings(self) -> list[Resolution]:
-        """All settings but the references."""
+        """All settings except the references."""
         out = [Resolution("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
         out += [Resolution("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
         return out + [Resolution("grid", n, self._substeps_of(n)) for n in self.grids[:-1]]
@@ -120,7 +120,7 @@ class Plan:
         }
 
     def _substeps_of(self, grid: int) -> int:
-        """As many substeps per cell width as the suite has."""
+        """The suite's number of substeps per cell width."""
         return round(self.usual * grid / self.grid)
 
 
@@ -173,7 +173,7 @@ def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
 
 
 class Attempt:
-    """A task with the actions that are tried and the states that they half reach."""
+    """A task with test actions, and a target that they partially reach."""
 
     def __init__(self, task: str, plan: Plan) -> None:
         """Build the scene of the task's first variant."""
@@ -187,8 +187,8 @@ class Attempt:
     def start(self, setting: Resolution) -> tuple[Scene, np.ndarray]:
         """Return the scene of a setting and its particles.
 
-        Grids have particles on a lattice, as many per cell: random ones would differ between grids by more
-        than the grids themselves.
+        For grids, particles are on a lattice with a fixed number per cell, because random particles would add
+        larger differences than the grids.
         """
         plan, scene = self._plan, self.scene
         if setting.axis == "grid":
@@ -207,9 +207,9 @@ class Attempt:
         """Simulate and time one setting.
 
         Args:
-            setting: The setting. The first one of an axis determines the target: the demonstration is run
-                with it, and its final state becomes the target.
-            repeats: Rollouts after the first, which compiles; the fastest of them is timed.
+            setting: The setting. The first setting of an axis determines the target, as the final state of
+                the demonstration.
+            repeats: Number of rollouts after the first, which compiles; the fastest counts.
 
         Returns:
             A result per contact model.
@@ -261,7 +261,7 @@ class Attempt:
         errors["score"] = abs(judged[0] - judged[1])
         lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
         if all(lengths):
-            # Without contact there is no gradient, hence no direction.
+            # Without contact the gradient is zero and has no direction.
             errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
             errors["angle_deg"] = angle(result.gradient, exact.gradient)
         return errors

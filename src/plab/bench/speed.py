@@ -6,7 +6,7 @@
     plab bench speed --task Move,Torus --precision float32 float64
     plab bench speed --paper                               the paper's table of ten tasks
 
-Rows are printed as they come, and written to --csv. docs/benchmarks.md explains the columns.
+Rows are printed immediately, and written to --csv. docs/benchmarks.md explains the columns.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def rows(
         kinds: Kinds of calls, keys of :data:`plab.bench.workload.KINDS`.
 
     Yields:
-        A row of :data:`COLUMNS` per kind; times are per environment step of the whole batch. A kind that
-        needs more memory than the budget is named on standard error and left out.
+        A row of :data:`COLUMNS` per kind; times are per environment step of the whole batch. Kinds that
+        exceed the memory budget are skipped, with a message on standard error.
     """
     gc.collect()
     load = build(cfg, batch, steps)

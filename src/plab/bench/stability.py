@@ -6,9 +6,9 @@
     plab bench stability --quick --family "1000 steps"
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
-steps, and of first variants over 1000. Every case is simulated forwards and backwards. It has survived if
-state, loss terms and gradient are finite, no particle ever moved by more than a cell in a substep, all
-particles are inside the domain, and the mass tensor holds all mass. The exit code is 1 if any case failed.
+steps, and of first variants over 1000. Every case is simulated forwards and backwards. A case passes if
+state, loss terms and gradient are finite, no particle moved by more than a cell in a substep, all particles
+are inside the domain, and the mass tensor contains all mass. The exit code is 1 if any case failed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class StressPlan:
     Attributes:
         particles: Particles per environment.
         variants: Variants of each task.
-        long_tasks: Tasks that are run over the long horizon.
+        long_tasks: Tasks simulated over the long horizon.
         long_horizon: Environment steps of the long horizon.
         horizon: Environment steps otherwise.
     """
@@ -69,7 +69,7 @@ QUICK = StressPlan(particles=64, variants=("1",), long_tasks=("Move",))
 
 @dataclass(frozen=True)
 class StressCase:
-    """A scene and actions that the simulator has to survive.
+    """A scene and actions of a stress test.
 
     Attributes:
         family: Group of cases.
@@ -96,7 +96,7 @@ def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarra
 
 
 def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Every component at one end of its range or the other, held for up to :data:`HOLD` steps."""
+    """Each component is at either end of its range, for up to :data:`HOLD` steps."""
     out = np.empty((steps, size))
     for column in out.T:
         lengths = rng.integers(1, HOLD + 1, size=steps)
@@ -124,7 +124,7 @@ def stress_cases(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
-    """Run cases in a precision, ``float32`` or ``float64``, and judge them.
+    """Run and evaluate cases in a precision, ``float32`` or ``float64``.
 
     Yields:
         A row of :data:`COLUMNS` per case: outcome (``survived`` or the failure), fastest particle [cells per
@@ -138,7 +138,7 @@ def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str,
         simulator.set_target(*_target(simulator))
         for at in range(0, len(group), simulator.batch):
             yield from _run_together(simulator, group[at : at + simulator.batch])
-        # Taichi's memory goes with the simulator, before the next one is built.
+        # Release the memory of the simulator before building the next one.
         del simulator
 
 
@@ -197,20 +197,20 @@ def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> Iterator
 
 
 def _outcome(precision: str, case: StressCase, e: int, state: State, mass: np.ndarray, speed: float) -> str:
-    """Judge the last state of environment e, its mass tensor and its speed [cells per substep]."""
+    """Evaluate the last state of environment e, its mass tensor and its speed [cells per substep]."""
     if not all(np.isfinite(getattr(state, name)[e]).all() for name in ("x", "v", "C", "F", "poses")):
         return "the last state is not finite"
     if state.x[e].min() < 0.0 or state.x[e].max() > 1.0 - 2.999 * case.scene.dx:
         return "a particle left the domain"
     error = abs(mass[e].sum() / (case.scene.particle_mass * case.scene.particle_count) - 1.0)
-    # The comparisons are written so that NaN fails them, too.
+    # NaN must fail these comparisons, too.
     if not error <= MASS_TOLERANCE[precision]:
         return f"mass changed by {error:.1e} of itself"
     return "survived" if speed <= 1.0 else "a particle crossed a cell in a substep"
 
 
 def summarise(rows: Sequence[Mapping[str, object]]) -> int:
-    """Print how many cases of each family survived; return the exit code."""
+    """Print the number of passed cases per family; return the exit code."""
     survived: dict[tuple, list[bool]] = defaultdict(list)
     for row in rows:
         survived[row["precision"], row["family"]].append(row["outcome"] == "survived")
@@ -230,7 +230,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def options_of(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
-    """Read the options of a command line that runs cases, with those that the parser already has."""
+    """Parse the options of a command that runs cases, in addition to those of the parser."""
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
     parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
@@ -247,7 +247,7 @@ def options_of(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
 def measure(
     options: argparse.Namespace, cases_of: Callable[[StressPlan], Iterable[StressCase]]
 ) -> list[Mapping[str, object]]:
-    """Run and print the cases of the plan that the options of :func:`options_of` ask for; return the rows."""
+    """Run and print the cases selected by the options of :func:`options_of`; return the rows."""
     cases = list(cases_of(options.plan))
     families = list(dict.fromkeys(case.family for case in cases))
     if unknown := set(options.family or ()) - set(families):

@@ -63,7 +63,7 @@ def rows(
         words: Further overrides.
         observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`.
     """
-    # Imported here: SciPy's start-up would be paid by every `--help`.
+    # Imported here, because SciPy would slow down every `--help`.
     from scipy import stats
 
     for name, (policy, own, trained_on) in policies.items():

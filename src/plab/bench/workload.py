@@ -28,7 +28,8 @@ SOLID = 0.1
 """Mass of a node that belongs to the target, as a share of the largest mass of any node."""
 
 WARM_UP = 2
-"""Uncounted calls after the first, which compiles: the CPU's kernels try sizes of their teams in them."""
+"""Number of warm-up calls after the first, which compiles; the CPU's kernels select their team sizes in
+them."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Workload:
 
     Attributes:
         cfg: The configuration of all environments.
-        simulator: Their simulator; its initial state is where the actions start.
+        simulator: Simulator; the actions start from its initial state.
         actions: Actions, shape [batch, T, A].
         first_step_s: Seconds of the very first step, which compiles or loads from Taichi's cache.
     """
@@ -60,28 +61,27 @@ def with_particles(overrides: Sequence[str], particles: int) -> Config:
 
 
 def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> Workload:
-    """Build a simulator and put it where the plasticine is being worked on.
+    """Build a simulator in a state with contact.
 
-    A task's own target takes time to make and none to compare with, so the initial shape, moved, is the
-    target.
+    The target is the shifted initial shape, because generating the task's own target takes time without
+    affecting the measurement.
 
     Args:
         cfg: The configuration.
         batch: Number of environments.
         steps: Environment steps of a rollout.
-        from_start: Start at the scene's own initial state, instead of in the middle of the best actions
-            known.
+        from_start: Start from the scene's initial state instead of the middle of the best known actions.
 
     Raises:
         plab.scenes.SceneError: If the scene cannot be simulated.
-        plab.targets.TargetError: If the target, which the best actions come from, has a mistake.
+        plab.targets.TargetError: If the target, from which the best actions are derived, is invalid.
         plab.sim.DeviceError: If CUDA is not available.
     """
     simulator = make_simulator([cfg] * batch)
     scene = simulator.scenes[0]
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
-    # Relative to the largest mass, because all masses are small where there are few particles.
+    # Relative to the largest mass, because masses are small with few particles.
     distance = target_sdf(mass, threshold=SOLID * mass.max())
     shape = (batch, *mass.shape)
     simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(distance, shape))
@@ -108,8 +108,8 @@ def _run(simulator: Simulator, actions: np.ndarray) -> None:
 
 
 def _before_contact(simulator: Simulator, actions: np.ndarray) -> int:
-    """Make the current state the initial one, and count the steps of actions, shape [batch, T, A], before a
-    manipulator touches a body; 0 if none does."""
+    """Make the current state the initial state, and return the number of steps of actions, shape [batch, T,
+    A], before the first contact; 0 without contact."""
     simulator.set_initial_state(simulator.state())
     simulator.reset()
     for t in range(actions.shape[1]):
@@ -120,7 +120,7 @@ def _before_contact(simulator: Simulator, actions: np.ndarray) -> int:
 
 
 def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:
-    """Return an episode's actions, shape [batch, T, A]: the best known, or random ones where none are."""
+    """Return the actions of an episode, shape [batch, T, A]: the best known, or random ones."""
     rng = np.random.default_rng(0)
     known = known_actions(cfg)
     if known is None:
@@ -149,8 +149,7 @@ KINDS: dict[str, Callable[[Workload], None]] = {
     GRADIENT: lambda load: _rollout(load, gradient=True),
 }
 """Kinds of calls that can be timed. The reward needs the loss terms and the IoU of every step on the host. A
-rollout is one call for all steps and their loss terms, as the optimisers make it; the backward pass includes
-it."""
+rollout is one call for all steps and their loss terms, as in optimisers; the backward pass includes it."""
 
 
 def time_calls(load: Workload, kind: str, repeats: int) -> tuple[float, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Shared parts of all commands: answers to mistakes and interruptions, the parser, and options."""
+"""Shared parts of all commands: handling of errors and interrupts, parser, and options."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
     from plab.results import Row
 
 EXIT_BUG, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 70, 130, 141
-"""Exit codes of a bug, by sysexits.h, of Ctrl-C, and of a closed pipe."""
+"""Exit codes for a bug (sysexits.h), Ctrl-C, and a closed pipe."""
 
 
 def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:
-    """Let a command report errors in one line.
+    """Wrap a command to report errors in one line.
 
     Args:
-        main: Takes the arguments after the program's name; returns the exit code, None for 0.
+        main: Function of the arguments after the program's name that returns the exit code, None for 0.
 
     Returns:
-        The same, with the arguments of the process by default. It prints an error in one line, and returns 2
-        for a mistake of the user's, 130 after Ctrl-C and SIGTERM, 141 for a closed output, and 70 for a bug.
+        The wrapped command, with the arguments of the process by default. It prints errors in one line, and
+        returns 2 for invalid input, 130 after Ctrl-C and SIGTERM, 141 for a closed output, and 70 for a bug.
         With ``PLAB_TRACEBACK`` set, a bug is raised.
     """
 
     @functools.wraps(main)
     def answered(argv: Sequence[str] | None = None) -> int:
-        # Compilation allocates many long-lived objects: collecting them often takes seconds.
+        # Compilation allocates many long-lived objects; frequent garbage collection would take seconds.
         gc.set_threshold(100_000)
         if threading.current_thread() is threading.main_thread():
-            # Schedulers and containers end a process by it: a run then writes a checkpoint, as after Ctrl-C.
+            # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
             signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             code = main(list(sys.argv[1:] if argv is None else argv)) or 0
@@ -52,7 +52,7 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
             sys.stdout.flush()
             return code
         except SystemExit as stop:
-            # Rich's answer to a closed pipe, or how argparse leaves after --help.
+            # Raised by Rich for a closed pipe, and by argparse after --help.
             return _close_output() if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
         except BrokenPipeError:
             return _close_output()
@@ -92,7 +92,7 @@ def _close_output() -> int:
 
 
 class Parser(ArgumentParser):
-    """The parser of a command: a docstring is its help, a mistake an ArgumentError."""
+    """The parser of a command, with a docstring as help; errors raise ArgumentError."""
 
     def __init__(self, name: str, text: str | None, **options: Any) -> None:
         """Make a parser without arguments of a command's name and docstring: purpose, then examples."""
@@ -101,7 +101,7 @@ class Parser(ArgumentParser):
         super().__init__(name, description=purpose, epilog=more, formatter_class=formed, **options)
 
     def error(self, message: str) -> NoReturn:
-        """Raise the mistake in one line, with the flags that there are where one is unknown."""
+        """Raise a one-line error, with suggestions for unknown flags."""
         unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
         flags = [flag for action in self._actions for flag in action.option_strings if flag[:2] == "--"]
         if unknown.startswith("-"):
@@ -110,8 +110,8 @@ class Parser(ArgumentParser):
 
 
 def add_sources(parser: ArgumentParser, words: str = "") -> None:
-    """Add the argument ``sources``: results, and words that choose among their runs, in any order."""
-    # Imported here, as below: h5py takes a fifth of a second.
+    """Add the argument ``sources``: results, and selections of runs, in any order."""
+    # Imported here, as below, because h5py takes a fifth of a second.
     from plab.results.examples import EXAMPLES
 
     what = f"folder, file or archive of results, or one of {', '.join(EXAMPLES)} (default: results)"
@@ -133,12 +133,12 @@ def add_forms(parser: ArgumentParser) -> Any:
 def sources_and_words(
     arguments: Sequence[str], default: str | None = "results"
 ) -> tuple[list[Path], list[str]]:
-    """Tell results from words that choose among their runs, as ``task=Rope`` does.
+    """Separate results from selections such as ``task=Rope``.
 
     Args:
         arguments: Names of results, plain or as ``results=NAME``, and selections. A folder with an equals
             sign in its name is a source if it exists.
-        default: Source where none is named; None: none.
+        default: Default source; None: none.
 
     Returns:
         The sources, and the words.
@@ -168,19 +168,19 @@ def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
 
 
 def positive(text: str, least: int = 1) -> int:
-    """Read a whole number from 1 on."""
+    """Parse a positive integer."""
     if not text.isdecimal() or int(text) < least:
         raise ArgumentTypeError(f"'{text}' is not a whole number from {least} on")
     return int(text)
 
 
 def seed(text: str) -> int:
-    """Read a whole number from 0 on."""
+    """Parse a nonnegative integer."""
     return positive(text, 0)
 
 
 def task_list(text: str) -> list[str]:
-    """Read names of tasks with commas between them."""
+    """Parse comma-separated names of tasks."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in (*suite_tasks(), *EXTENSION_TASKS):
@@ -189,22 +189,22 @@ def task_list(text: str) -> list[str]:
 
 
 def folder(text: str) -> Path:
-    """Read the name of a folder: an empty one would be the working directory."""
+    """Parse the name of a folder, which must not be empty."""
     if not text.strip():
         raise ArgumentTypeError("is empty: give the name of a folder, or . for this one")
     return Path(text).expanduser()
 
 
 def results_source(text: str) -> Path:
-    """Read a folder, file or archive of results, or one of the names of real runs."""
+    """Parse a folder, file or archive of results, or the name of a bundled archive."""
     from plab.results.examples import EXAMPLES, resolve
 
-    # As a path ./example would be the name.
+    # The path ./example would become the name.
     return resolve(text) if text in EXAMPLES else folder(text)
 
 
 def to_write(text: str) -> Path:
-    """Read the name of a file that can be written: hours of work should not end in none."""
+    """Parse the name of a file, and check that it can be written before any computation."""
     path = folder(text)
     # Missing parent folders are created when writing.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))

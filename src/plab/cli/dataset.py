@@ -32,7 +32,7 @@ from plab.results import read
 from plab.scenes import Camera
 
 REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVATION_KEYS)
-"""Keys that change how the runs of results are replayed; other words choose among them."""
+"""Keys that apply to the replay of results; other keys select runs."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Demonstration:
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Write demonstrations as datasets in Minari's format, one for each task.
+    """Write demonstrations as datasets in Minari's format, one per task.
 
     plab dataset KEY=VALUE ...                  the best known actions of tasks, or their targets' scripts
     plab dataset KEY=VALUE ... method=NAME      actions that a method finds; its runs go to results_dir
@@ -161,7 +161,7 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
     parsed = {one.key_or_group: one for one in parse(prepared(words))}
     rows = finished_rows(sources, [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED])
     changes = {key: one.value() for key, one in parsed.items() if key in REPLAYED}
-    # Without a gradient the budget of memory has no effect, but all have to have the same.
+    # Without a gradient the memory budget has no effect, but must be equal.
     sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}
     sim |= {key[4:]: value for key, value in changes.items() if key.startswith("sim.")}
     own = {key: value for key, value in changes.items() if key in OBSERVATION_KEYS}
@@ -180,10 +180,10 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
 
 
 class _Recorder:
-    """Plays demonstrations of one task, some at a time.
+    """Replay of demonstrations of one task in batches.
 
     Attributes:
-        spaces: Spaces of observations and of actions; they hold those of all scenes.
+        spaces: Spaces of observations and actions, covering all scenes.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The texts of ``plab run --help`` and ``--help-all``, made from the YAML files."""
+"""Texts of ``plab run --help`` and ``--help-all``, generated from the YAML files."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _COMMON_KEYS = {
     "method/adam.yaml": ("method.iterations", "method.lr"),
     "sim/fast.yaml": ("sim.device", "sim.particles_scale"),
 }
-"""Keys that the short text explains, by the file that has them."""
+"""Keys explained in the short text, by file."""
 
 _WIDTH, _SHORT, _LONG = 100, 24, 52
-"""Columns of the short text; of a key and its default, in the short text and in the long one."""
+"""Column widths of the short text, and of keys and defaults in both texts."""
 
 _KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P<comment>.*))?$")
 

@@ -85,12 +85,12 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
     _require_runs(runs, options.sources)
     page = Page(runs, out, origin(runs, command, deep=False), every_run=options.every_run)
     wanted = missing_pictures(page.shown, out) if options.pictures else {}
-    # It is complete but for pictures before the first of them is drawn.
+    # The page is complete except for pictures before rendering starts.
     page.write(drawing=bool(wanted))
     if wanted:
         try:
             require_graphics()
-            # Imported here: all else needs neither PyVista nor Taichi.
+            # Imported here, because everything else works without PyVista and Taichi.
             from plab.render.pictures import draw_runs
 
             draw_runs(wanted, lambda: page.write(drawing=True))
@@ -103,7 +103,7 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
-"""Functions that make reports, by name; each returns its summary."""
+"""Functions that generate reports, by name; each returns a summary."""
 
 
 def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:

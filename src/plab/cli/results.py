@@ -40,13 +40,13 @@ def main(argv: Sequence[str]) -> int | None:
     """Run the command line.
 
     Returns:
-        Exit code: 0, 1 if ``check`` found a fault, 2 for a mistake of the user's.
+        Exit code: 0, 1 if ``check`` found a fault, 2 for invalid input.
     """
     parser = Parser("plab results", __doc__)
     parser.add_argument("command", choices=_COMMANDS, help="what to do; it has a --help of its own")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
-    # Not by subparsers: they cannot have words on both sides of an option.
+    # Without subparsers, which do not support positional arguments on both sides of an option.
     return _COMMANDS[first.command](first.arguments)
 
 
@@ -97,7 +97,7 @@ def _check(argv: Sequence[str]) -> int:
 
 
 def _pack(argv: Sequence[str]) -> None:
-    """Put runs into one small file."""
+    """Pack runs into an archive."""
     parser = Parser("plab results pack", _pack.__doc__)
     add_sources(parser, "runs to take: task=Rope,Move status=all (default: finished)")
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
@@ -129,7 +129,7 @@ def _pack(argv: Sequence[str]) -> None:
 
 
 def _unpack(argv: Sequence[str]) -> None:
-    """Make files of the runs of an archive; files that are there stay."""
+    """Unpack the runs of an archive; existing files are unchanged."""
     parser = Parser("plab results unpack", _unpack.__doc__)
     parser.add_argument("archive", type=results_source, help="archive to read")
     parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")

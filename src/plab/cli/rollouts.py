@@ -1,4 +1,4 @@
-"""The commands ``plab render``, ``view`` and ``export``, which show a rollout: of a run, or of a task."""
+"""The commands ``plab render``, ``view`` and ``export`` for rollouts of runs or tasks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from plab.config import Config
 
 _FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
-"""Pixels of a film's frame, of a cell of the contact sheet, and of a frame of the film strip."""
+"""Sizes of a film's frame, a cell of the contact sheet, and a frame of the film strip [pixels]."""
 
 _MAX_FRAME_SIZE = 4096
 """Largest frame width and height [pixels], supported by all OpenGL versions and by H.264."""
@@ -73,7 +73,7 @@ def render(argv: Sequence[str]) -> None:
         path = resolve_rollout(options, ".png")
     require_writable(path)
     require_graphics()
-    # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
+    # Imported here, as below, because they load the simulator, which the checks above do not need.
     from plab.render import pictures
     from plab.render.rollouts import demonstration, record, starts
 
@@ -186,7 +186,7 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
 
 
 def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
-    """Find the rollout, as far as can be done without simulating.
+    """Find the rollout, without simulating.
 
     Adds ``result``, the result file or None, and ``config``, the configuration where there is none; and
     ``output`` where it was not given: named like the result, with ``ending`` for ``.h5``, and beside it (but
@@ -199,7 +199,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         RenderError: If nothing is selected, or both a run and a task.
         plab.config.ConfigError: If the configuration is wrong.
     """
-    # Imported here, as below: h5py and pandas load, for which no mistake should have to wait.
+    # Imported here, as below, because h5py and pandas are slow to load.
     from plab.results.schema import ARCHIVE_SUFFIX
 
     sources, words = sources_and_words(options.what, default=None)
@@ -226,8 +226,8 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
 
 
 def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
-    """Return place and name of the finished run with the highest score, of those that the words choose."""
-    # Of runs with the same score the one that the page of results shows.
+    """Return path and name of the selected finished run with the highest score."""
+    # Ties are broken as on the results page.
     rows = finished_rows(sources, words)
     best = min(rows, key=lambda row: (-row.values["score"], row.values["config_hash"]))
     task, variant, method, seed = (best.values[name] for name in ("task", "variant", "method", "seed"))
@@ -247,7 +247,7 @@ def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
 
 
 def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
-    """Refuse results, and words that begin like one of ``own``, for a picture of all tasks."""
+    """Reject results, and overrides of keys in ``own``, for a picture of all tasks."""
     unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
     if unwanted or (options.output and not getattr(options, "gallery", False)):
         raise ArgumentError(f"all tasks are shown: leave out '{(*unwanted, '--output')[0]}'")

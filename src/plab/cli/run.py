@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     try:
         if (master := _sweep_settings(options, words)) is not None:
-            # Imported here, as below: torch and Taichi take seconds, which no mistake should wait for.
+            # Imported here, as below, because torch and Taichi take seconds to load.
             from plab.sweep.running import sweep
 
             return sweep(words, master, config_dir)
@@ -63,12 +63,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | None:
-    """Return a configuration with Hydra's settings of a sweep, None of a single run."""
+    """Return a configuration with Hydra's settings for a sweep, or None for a single run."""
     by_key = [(one.key_or_group, one) for one in parse(words)]
     own = [one for key, one in by_key if key == EXPERIMENT or one.is_hydra_override()]
     if not own and not options.multirun:
         return None
-    # Folders for the logs of launchers; other keys may be of another method or task than the default's.
+    # Folders for the logs of launchers; other keys may belong to another method or task than the default.
     own += [one for key, one in by_key if key == "results_dir" and not one.is_sweep_override()]
     master = compose_with_hydra([str(one.input_line) for one in own], options.config_dir)
     if options.multirun or str(master.hydra.mode).endswith("MULTIRUN"):

@@ -1,7 +1,7 @@
-"""Show what is done, running, failed and missing.
+"""Show finished, running, failed and missing runs.
 
-The runs that the results have. Words choose among them as those of a sweep do, and ask for all combinations
-of what they name, so that those which are not there are missing; --missing asks for the whole suite.
+Without arguments, the runs in results. Selections such as task=Rope seed=0,1 request all combinations of the
+given values, and show the missing ones; --missing requests the whole suite.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
         groups = [asdict(group) | group.counts for group in look().groups]
         print_table(columns, ([group[name] for name in columns] for group in groups), "csv")
     else:
-        # Imported here: scripts need no tables.
+        # Imported here, because scripts need no tables.
         from plab.status.view import show, watch
 
         if options.form == "watch":

@@ -38,14 +38,14 @@ _PACKAGE = "plab.submissions"
 
 @command_line
 def submit(argv: Sequence[str]) -> None:
-    """Pack what a method produced into one file for the leaderboard.
+    """Pack the results of a method into one file for the leaderboard.
 
     plab submit recordings --card card.yaml --output mine.plabsub.zip
     plab submit results method=adam seed=0 --card card.yaml --output adam.plabsub.zip
     plab submit --policy Move=move.pt --steps 100000 --card card.yaml --output policy.plabsub.zip
 
-    Recordings are written by plab.submissions.record; words such as method=adam choose among results. A
-    policy is run here, to see what it reaches; overrides such as sim.device=cuda may follow.
+    Recordings are written by plab.submissions.record; selections such as method=adam apply to results.
+    Policies are executed to compute their scores; overrides such as sim.device=cuda may follow.
     """
     parser = Parser("plab submit", submit.__doc__)
     add = parser.add_argument
@@ -96,14 +96,14 @@ def _policy(text: str) -> tuple[str, Path]:
 
 @command_line
 def verify(argv: Sequence[str]) -> int:
-    """Simulate submissions again and say what they really score, in float32 and in float64.
+    """Simulate submissions again and print their scores, in float32 and in float64.
 
     plab verify mine.plabsub.zip
     plab verify submissions --run-policies sim.device=cuda
 
-    Exit code: 0 if all claims hold, 1 if one does not or was not run, 2 if a file cannot be judged. What was
-    found is kept beside each file, for plab leaderboard. Plans are data; policies are programs of other
-    people, and run only if --run-policies is given.
+    Exit code: 0 if all claims hold, 1 if one does not or was not run, 2 if a file cannot be verified. The
+    outcome is stored beside each file, for plab leaderboard. Plans are data; policies are programs from
+    others, and executed only with --run-policies.
     """
     parser = Parser("plab verify", verify.__doc__)
     what = f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda"
@@ -124,12 +124,12 @@ def verify(argv: Sequence[str]) -> int:
                 submission, words, run_policies=options.run_policies, precisions=precisions
             )
         except PlabError as error:
-            # A file that cannot be judged does not keep the others from it.
+            # An invalid file does not prevent the verification of others.
             tell(str(error))
             codes.append(error.exit_code)
             continue
         _show(submission, found, precisions)
-        # Of a policy that was not run one line is enough.
+        # One line suffices for a policy that was not run.
         for why in dict.fromkeys(verdict.why for verdict in found.verdicts if verdict.why):
             tell(f"{path}: {why}")
         kept = write_verification(found, path)
@@ -165,12 +165,12 @@ def _show(submission: Submission, verification: Verification, precisions: Sequen
 
 @command_line
 def leaderboard(argv: Sequence[str]) -> None:
-    """Write one static page from a folder of submissions: tracks, equal budgets, a table for each protocol.
+    """Write a static page for a folder of submissions: tracks, equal budgets, a table per protocol.
 
     plab leaderboard submissions
     plab leaderboard submissions --out public/leaderboard
 
-    Run plab verify on the folder before: what it has kept is shown. The page is index.html; it needs no
+    Run plab verify on the folder first; its stored outcomes are shown. The page is index.html; it needs no
     server.
     """
     parser = Parser("plab leaderboard", leaderboard.__doc__)

@@ -1,4 +1,4 @@
-"""The commands ``plab demonstrations`` and ``plab targets``, about all tasks and variants of the suite."""
+"""The commands ``plab demonstrations`` and ``plab targets`` for all tasks and variants of the suite."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
 
 
 def variants(task: str, overrides: Sequence[str]) -> list[Config]:
-    """Return the configurations of a task's variants, the first of them checked."""
+    """Return the configurations of a task's variants; the first one is checked."""
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
     check_sources(cfgs[0])
     return cfgs
@@ -72,7 +72,7 @@ def demonstrations(argv: Sequence[str]) -> None:
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
-    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None is no motion."""
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None means no motion."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
@@ -136,8 +136,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
     Returns:
         A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and
         standard deviation along x, y, z [domain units], share of the mass that has to move from the start,
-        mean distance of the start's mass from the target [domain units], seconds that building took on
-        average.
+        mean distance of the start's mass from the target [domain units], average build time [s].
     """
     cfgs = variants(task, overrides)
     for cfg in cfgs:

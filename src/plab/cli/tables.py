@@ -1,4 +1,4 @@
-"""Tables as all commands print and write them."""
+"""Printing and writing of tables."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def measure_table(
         rows: A value per column; each row is printed and written before the next is requested, so that
             interruptions lose nothing.
         path: CSV file to write, or None.
-        widths: Least widths of columns on the screen, where the usual one does not do.
+        widths: Minimum widths of columns on the screen, if not the default.
 
     Returns:
         The rows.
     """
-    # Imported here: Rich, which it loads, is of no use to other tables.
+    # Imported here, because other tables do not need Rich.
     from plab.progress import show_line
 
     least = [max(len(name), (widths or {}).get(name, 8)) for name in columns]
@@ -47,7 +47,7 @@ def measure_table(
     table: list[Mapping[str, object]] = []
     for row in rows:
         if not table:
-            # Not before, so that a mistake is answered by one line alone.
+            # Not earlier, so that errors print only one line.
             show(columns)
         values = [row[name] for name in columns]
         show(values)
@@ -64,7 +64,7 @@ def write_csv(path: Path, rows: Iterable[Iterable[Any]], mode: str = "w", digits
         path: The file.
         rows: Its rows; the names of the columns are the first.
         mode: ``w``, or ``a`` to add rows to those that are there.
-        digits: Digits of numbers with a fraction; all if None.
+        digits: Digits of fractional numbers; default: all.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if digits is not None:

@@ -1,7 +1,7 @@
-"""Reference demonstrations: for every configuration of the suite the best actions that are known.
+"""Reference demonstrations: the best known actions for every configuration of the suite.
 
-For a scripted target they are the script's own, for a geometric one the best of all runs. One file per
-task, ``<Task>.csv``, has a row per variant and environment step; ``scores.csv`` has their scores.
+For scripted targets they are the actions of the script, for geometric targets the best of all runs. One file
+per task, ``<Task>.csv``, has a row per variant and environment step; ``scores.csv`` has their scores.
 ``benchmarks/record_demonstrations.py`` writes both; ``plab demonstrations`` replays them.
 """
 
@@ -43,20 +43,20 @@ def known_actions(cfg: Config) -> np.ndarray | None:
     """Return the best known actions for a configuration: the script of its target, or recorded actions.
 
     Args:
-        cfg: A configuration, also one that is not of the suite.
+        cfg: A configuration, also outside the suite.
 
     Returns:
         Actions in [-1, 1], shape [T, A]; None for a geometric target without a record.
 
     Raises:
-        plab.targets.TargetError: If the target has a mistake.
+        plab.targets.TargetError: If the target is invalid.
     """
     scripted = demonstration(build_scene(cfg), cfg.task.target)
     return load_actions(cfg.task.name, cfg.variant) if scripted is None else scripted
 
 
 def recorded_scores() -> pd.DataFrame:
-    """Return the scores of the demonstrations when they were recorded: columns task, variant, score."""
+    """Return the recorded scores of the demonstrations: columns task, variant, score."""
     path = FOLDER / SCORES
     if not path.is_file():
         return pd.DataFrame(columns=["task", "variant", "score"])

@@ -2,7 +2,7 @@
 
 A dataset is a folder ``<namespace>/<name>-v<k>/data`` of two files: ``main_data.hdf5`` has a group of each
 episode, with observations and infos of T + 1 states and actions, rewards, terminations and truncations of T
-steps; ``metadata.json`` has the spaces. The package minari reads both, and is not needed here.
+steps; ``metadata.json`` has the spaces. The package minari can read both, but is not required.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ARRAYS = ("actions", "rewards", "terminations", "truncations")
 
 
 class DatasetError(PlabError, ValueError):
-    """A dataset that cannot be read or written; the message names it and the reason."""
+    """A dataset cannot be read or written; the message names it and the reason."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Episode:
         actions: Actions, shape [T, A].
         rewards: Rewards, shape [T].
         infos: Measures of the states, by name, shape [T + 1] each.
-        attributes: Facts about the episode: numbers and texts by name.
+        attributes: Attributes of the episode: numbers and texts by name.
     """
 
     observations: Any
@@ -64,21 +64,21 @@ def write_dataset(
     env_spec: EnvSpec,
     about: Mapping[str, Any],
 ) -> list[Mapping[str, Any]]:
-    """Write a dataset; it appears when it is whole.
+    """Write a dataset atomically.
 
     Args:
         folder: Folder of datasets, such as ``MINARI_DATASETS_PATH`` names.
         name: Name of the dataset in it, such as ``plab/Move-v0``.
         episodes: Episodes, held in memory one at a time.
         spaces: Spaces of observations and actions.
-        env_spec: Environment that minari's ``recover_environment`` is to make.
+        env_spec: Environment of minari's ``recover_environment``.
         about: Further metadata.
 
     Returns:
         The attributes of the episodes.
 
     Raises:
-        DatasetError: If there is such a dataset, or there are no episodes.
+        DatasetError: If the dataset exists, or there are no episodes.
     """
     place = folder / name / "data"
     if place.exists():

@@ -1,6 +1,6 @@
 """VTK and PLY files of particles with their fields, surfaces of plasticine and manipulators, and the target.
 
-VTK's own writers write them, through PyVista.
+Files are written by VTK, through PyVista.
 """
 
 from __future__ import annotations

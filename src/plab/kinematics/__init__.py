@@ -1,4 +1,5 @@
-"""Articulated models: from actions in joint space to twists of rigid links, and the adjoint back."""
+"""Articulated models: forward kinematics from joint-space actions to twists of rigid links, and its
+adjoint."""
 
 from plab.kinematics.chain import Chain, Joint, Link, ModelError
 from plab.kinematics.models import locate_model, read_model

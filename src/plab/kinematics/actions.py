@@ -1,9 +1,9 @@
-"""Actions in joint space, turned into twists of a chain's links, and the adjoint back; in PyTorch.
+"""Conversion of joint-space actions to twists of the links of a chain, and its adjoint, in PyTorch.
 
 In an environment step every joint moves by its share of the action, within its limits. Forward kinematics
-gives the links' frames before and after; a link's twist is its displacement and the logarithm of its relative
-rotation, so that it arrives exactly where the joints say. Sums are written out: a product's bits must not
-depend on the number of environments.
+gives the frames of the links before and after; a link's twist is its displacement and the logarithm of its
+relative rotation, so that its final pose is exact. Sums are written out, so that results are bitwise
+independent of the number of environments.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class LinkMotion:
     """Motion of the links in some environment steps, with its pullback.
 
     Attributes:
-        twists: Actions of the simulator, shape [T, batch, component]; like the actions an array or a tensor.
+        twists: Actions of the simulator, shape [T, batch, component], as an array or a tensor like the
+            actions.
         joints: Joint positions after the last step, shape [batch, joint], likewise.
     """
 
@@ -58,8 +59,7 @@ class JointActions:
     """
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Take the scenes' chains; the scenes' other manipulators keep their own components, which come
-        first."""
+        """Initialise with the chains of the scenes; components of other manipulators come first."""
         chains: list[Chain] = [scene.kinematics for scene in scenes]  # type: ignore[misc]
         first = chains[0]
         self._direct = scenes[0].action_dim - len(first.components)
@@ -94,7 +94,7 @@ class JointActions:
         Args:
             joints: Joint positions before the first step, shape [batch, joint].
             actions: Actions, shape [T, batch, A], float64; an array, or a tensor on any device.
-            gradient: Whether :meth:`LinkMotion.pull_back` is to be called.
+            gradient: Whether :meth:`LinkMotion.pull_back` will be called.
         """
         given = torch.as_tensor(actions).requires_grad_()
         before = torch.as_tensor(joints).detach().to(given).requires_grad_()
@@ -125,7 +125,7 @@ class JointActions:
     def _joint_frames(joints: Tensor, c: dict[str, Tensor]) -> Tensor:
         """Transforms of the joints' own motions, shape [T, batch, joint, 4, 4], by Rodrigues' formula."""
         angle = (joints * c["hinge"])[..., None, None]
-        # In homogeneous coordinates: the anchor stays where it is, a slide moves along its axis.
+        # In homogeneous coordinates: rotations fix the anchor, slides move along the axis.
         turn = angle.sin() * c["cross"] + (1.0 - angle.cos()) * c["cross2"]
         return c["eye"] + _product(turn, c["to_anchor"]) + joints[..., None, None] * c["slide"]
 
@@ -156,7 +156,7 @@ def rotation_vector(turn: Tensor) -> Tensor:
     cosine = 0.5 * (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1.0)
     small = (square < 1e-8) & (cosine > 0.0)
     sine = torch.where(small, 1.0, square).sqrt()
-    # angle / sin(angle), as a series in sin(angle)^2 where both vanish.
+    # angle / sin(angle), as a series in sin(angle)^2 near 0.
     ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, torch.atan2(sine, cosine) / sine)
     return ratio[..., None] * axis
 

@@ -1,4 +1,4 @@
-"""Kinematic trees: joints with limits, and links that they carry. Plain data and NumPy."""
+"""Kinematic trees of joints with limits, and links. Plain data and NumPy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ BASE_JOINTS = {
 
 
 class ModelError(PlabError, ValueError):
-    """A model that cannot be read, or not be used; the message is one line that names it."""
+    """A model cannot be read or used; the one-line message names it."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Joint:
         name: Its name.
         parent: Index of the joint that carries it, -1 for the world.
         offset: Transform from its frame at position 0 to the parent's frame.
-        hinge: Whether it turns about the axis; it slides along it otherwise.
+        hinge: Whether it rotates about the axis instead of sliding along it.
         axis: Unit vector, in its own frame.
         anchor: A point of the axis of a hinge, likewise [domain units].
         low: Lowest position [rad or domain units].
         high: Highest position.
         scale: Motion per environment step at action 1.
         start: Position at t = 0.
-        component: Index of the component of the chain's action that moves it.
+        component: Index of the action component that moves it.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Joint:
 
     def matrix(self, position: float) -> np.ndarray:
         """Transform from its frame to the parent's, shape [4, 4]."""
-        # Imported here, as below: it takes half a second, and few scenes have a model.
+        # Imported here, as below, because it takes half a second and few scenes have a model.
         from scipy.spatial.transform import Rotation
 
         own, axis, anchor = np.eye(4), np.array(self.axis), np.array(self.anchor)
@@ -117,7 +117,7 @@ class Chain:
 
     @property
     def topology(self) -> tuple[object, ...]:
-        """Structure that the chains of all scenes of one simulator share."""
+        """Structure that must be equal for all scenes of a simulator."""
         joints = tuple((joint.parent, joint.hinge, joint.component) for joint in self.joints)
         return joints, tuple((link.parent, link.shape) for link in self.links)
 
@@ -134,13 +134,13 @@ class Chain:
     @staticmethod
     def action_map(scenes: Sequence[Scene]) -> JointActions:
         """Map from actions to twists, for a batch of scenes with chains of one topology."""
-        # Imported here: PyTorch is for those who simulate, not for those who read configurations.
+        # Imported here, because reading configurations does not need PyTorch.
         from plab.kinematics.actions import JointActions
 
         return JointActions(scenes)
 
     def largest_step(self) -> float:
-        """Bound on how far any point of a link moves in an environment step [domain units]."""
+        """Upper bound of the displacement of any point of a link in an environment step [domain units]."""
         most = 0.0
         for link in self.links:
             reach = float(np.linalg.norm(np.array(link.offset)[:3, 3])) + sum(link.size)
@@ -170,15 +170,16 @@ class Chain:
         Args:
             position: Origin of the model [domain units].
             rotation: Quaternion w, x, y, z from the model's axes to the world's.
-            free: Whether the base moves, by :data:`BASE_JOINTS`; it is fixed otherwise.
-            scale: Motion per environment step at action 1, by patterns of joint names; of several that match
-                the last counts. Joints without one stay at their start.
+            free: Whether the base can move, by :data:`BASE_JOINTS`.
+            scale: Motion per environment step at action 1, by patterns of joint names; the last match
+                applies. Joints without one are fixed.
             start: Positions at t = 0, by patterns.
-            limits: Lowest and highest positions, likewise; the model's where nothing matches.
+            limits: Lowest and highest positions, likewise; default: the model's.
             together: Patterns of joints that one component of the action moves, by its name.
 
         Raises:
-            ModelError: If a pattern matches no joint, a joint starts outside its limits, or nothing moves.
+            ModelError: If a pattern matches no joint, an initial position is outside its limits, or no joint
+                can move.
         """
         turn = pose_matrix((0.0, 0.0, 0.0), rotation)
         base = [
@@ -221,9 +222,9 @@ class Chain:
         return Chain(tuple(numbered), tuple(links), tuple(components)).moving()
 
     def moving(self) -> Chain:
-        """The same chain without the joints that stay where they start."""
+        """The same chain without fixed joints."""
         kept: list[Joint] = []
-        # Of each joint: index of the joint that carries its frame now, and transform to that frame.
+        # For each joint: index of its new parent joint, and transform to its frame.
         frames: list[tuple[int, np.ndarray]] = []
 
         def below(node: Joint | Link) -> tuple[int, np.ndarray]:
@@ -246,7 +247,7 @@ class Chain:
 
 
 def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:
-    """Values of a table by names, given by patterns, regular expressions of whole names; ModelError, which
+    """Return values by name from a table with patterns, regular expressions of whole names; ModelError, which
     begins with ``key``, if one matches no name."""
     found: dict[str, Any] = {}
     for pattern, value in table.items():

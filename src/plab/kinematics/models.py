@@ -36,11 +36,11 @@ def read_model(
         model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
         root: Body whose frame becomes the model's; default: the model's world frame.
         size: Domain units per unit of length of the model.
-        omit: Patterns of names of geometry that is left out.
+        omit: Patterns of names of geometry to leave out.
 
     Returns:
-        The tree with its joints at the model's rest, limits of the model, and scale 0; and the SHA-256 of all
-        its numbers.
+        The tree with joints at the model's rest position, the model's limits, and scale 0; and the SHA-256 of
+        all its numbers.
 
     Raises:
         ModelError: If `mujoco`, the file, or the body is missing, something in it is not supported, or a
@@ -81,7 +81,7 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
         names = ", ".join(m.body(k).name for k in range(1, m.nbody))
         raise ModelError(f"{path} has no body '{root}'; choose from: {names}")
     joints: list[Joint] = []
-    # Of each body: joint that carries it, and transform to that joint's frame.
+    # For each body: parent joint, and transform to its frame.
     frames: dict[int, tuple[int, np.ndarray]] = {first: (-1, np.eye(4))}
     for body in range(first, m.nbody):
         if body != first:
@@ -123,7 +123,7 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
         if shape is None:
             raise ModelError(f"{path}: {name} is of type {kind.lower()}: use a capsule, box, sphere or mesh")
         links.append(Link(parent, _rounded(own @ inside), f"{shape}Link", tuple(_rounded(lengths))))
-    # Links of one shape share one compiled loop.
+    # Links of the same shape share a compiled loop.
     links.sort(key=lambda link: link.shape)
     if not links:
         raise ModelError(f"{path}: nothing below {root or 'the world'} has collision geometry")

@@ -1,4 +1,4 @@
-"""Constitutive laws, a file each: parameters, stress, limit of the time step."""
+"""Constitutive laws, one per file: parameters, stress, time step limit."""
 
 from plab.laws.law import Law, Parameter
 

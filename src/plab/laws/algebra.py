@@ -123,9 +123,9 @@ class Series:
         log_terms: Terms of the atanh series (odd powers of Z).
         exp_terms: Terms of the exponential series.
         cbrt_steps: Newton steps for J^(-1/3) from its second-order expansion at 1.
-        z_squared_max: Largest |Z|^2 (Frobenius) that the series serve.
-        j_min: Smallest J that the series serve.
-        j_max: Largest J that the series serve.
+        z_squared_max: Largest |Z|^2 (Frobenius) in the range of the series.
+        j_min: Smallest J in the range of the series.
+        j_max: Largest J in the range of the series.
     """
 
     log_terms: int

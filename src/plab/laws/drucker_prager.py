@@ -1,11 +1,11 @@
 """Sand: Hencky elasticity with Drucker-Prager plasticity (Klar et al., 2016).
 
 Sand carries shear up to a multiple of its pressure: with the principal Hencky strains e of the trial state,
-the norm of the deviator is limited to ``-alpha (3 lambda + 2 mu) / (2 mu) tr e``, at constant volume. Where
-the trace is positive nothing is carried.
+the norm of the deviator is limited to ``-alpha (3 lambda + 2 mu) / (2 mu) tr e``, at constant volume. States
+with a positive trace carry no stress.
 
-F keeps the volume by which separated sand has expanded, so that it carries pressure again only once it is
-back at its volume: the volume correction of Tampubolon et al. (2017).
+F stores the volumetric expansion of separated sand, so that it carries pressure only after returning to its
+original volume: the volume correction of Tampubolon et al. (2017).
 """
 
 import math

@@ -1,6 +1,6 @@
 """Neo-Hookean elasticity: tau = mu (b - I) + lambda J (J - 1) I, with b = F F^T and J = det F.
 
-A polynomial of F, so that it holds for inverted particles, too.
+A polynomial of F, also valid for inverted particles.
 """
 
 from plab.laws.algebra import det, outer_sym, trial_gradient

@@ -1,7 +1,7 @@
 """Weakly compressible viscous fluid: tau = -p J I + 2 eta J dev D, with p = K (1 - J).
 
 D is the symmetric part of C.
-F keeps the volume ratio alone, as diag(J, 1, 1).
+F stores only the volume ratio, as diag(J, 1, 1).
 """
 
 from plab.laws.algebra import SYM, det, trial_gradient

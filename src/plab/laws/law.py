@@ -18,7 +18,7 @@ class Parameter:
 
     Attributes:
         name: Key in a task's YAML.
-        default: Value where none is given.
+        default: Default value.
         interval: Admissible values, such as ``(0, inf)`` or ``[0, 0.5)``.
         unit: Unit; empty for a number.
         meaning: Short description.
@@ -79,16 +79,16 @@ class Law:
         return len(self.coefficients_of(self.defaults))
 
     def coefficients_of(self, values: Mapping[str, float]) -> list[float]:
-        """Return the coefficients that belong to values of the parameters."""
+        """Return the coefficients for parameter values."""
         return [float(number) for number in self.coefficients(*(values[key] for key in self.keys))]
 
     def largest_step(self, values: Mapping[str, float], dx: float) -> float:
         """Return the largest stable time step [s] on a grid of spacing dx.
 
-        A lone particle's kernel has the second moment dx^2 / 4 wherever the particle is. Symplectic Euler is
+        The kernel of a single particle has the second moment dx^2 / 4 at any position. Symplectic Euler is
         stable while K dt^2 + 4 eta dt < dx^2, with the stiffness K and the viscosity eta, at density 1. No
-        mode of a body is faster, because the grid's mass is that of the particles, summed (Irons and
-        Treharne, 1971).
+        mode of a body is faster, because the grid mass is a sum over the particles (Irons and Treharne,
+        1971).
         """
         found = self.coefficients_of(values)
         stiffness, viscosity = float(self.stiffness(*found)), float(self.viscosity(*found))

@@ -1,4 +1,5 @@
-"""Principal stretches: eigenvalues and directions of b = G G^T, and symmetric tensors of the same directions.
+"""Principal stretches: eigenvalues and directions of b = G G^T, and symmetric tensors with the same
+directions.
 
 Jacobi's method with a fixed number of sweeps and no branches. The derivative is that of an isotropic tensor
 function: eigenvalues in fixed directions, and rotations of the directions by divided differences, with their
@@ -63,12 +64,12 @@ class PrincipalFrame:
     def tensor(self, principal):
         """Return the symmetric tensor (6) with these principal directions and the given principal values.
 
-        They have to be the same function of the eigenvalues for each direction.
+        They must be the same function of the eigenvalues for each direction.
         """
         q = self._axes
         out = [total(principal[k] * (q[k][i] * q[k][j]) for k in range(3)) for i, j in SYM]
         if isinstance(self._b[0], Node):
-            # Zero, with the derivative of turning directions.
+            # Zero, with the derivative of rotating directions.
             for k, m in _OFF:
                 turn = frozen(self._divided_difference(principal, k, m)) * self._component(k, m)
                 both = [q[k][i] * q[m][j] + q[m][i] * q[k][j] for i, j in SYM]

@@ -1,10 +1,9 @@
 """Reverse-mode differentiation of functions of components, by tracing.
 
-A function that is called with the numbers of a :class:`Trace` records a node per operation.
-:func:`derivatives` walks the record backwards and adds the nodes of the adjoints; :func:`evaluated` computes
-nodes with numbers of any kind: NumPy's arrays, or :class:`plab.sim.codegen.llvm.Number`, which writes LLVM's
-instructions.
-Equal nodes are recorded once, and unused nodes are not computed.
+A function called with the numbers of a :class:`Trace` records a node per operation. :func:`derivatives`
+traverses the record backwards and adds the nodes of the adjoints; :func:`evaluated` computes nodes with
+numbers of any kind: NumPy arrays, or :class:`plab.sim.codegen.llvm.Number`, which generates LLVM
+instructions. Equal nodes are recorded once, and unused nodes are not computed.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import numpy as np
 __all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen"]
 
 Number = Any
-"""A node, or a constant that needs none."""
+"""A node or a constant."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def frozen(number: Number) -> Number:
 
 
 class Trace:
-    """A record of operations, in the order in which they can be computed."""
+    """A record of operations, in topological order."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -120,7 +119,7 @@ class Trace:
         return [self.node("input", f"{name}{k}") for k in range(count)]
 
     def node(self, operation: str | Primitive, *arguments: Number) -> Node:
-        """Record an operation, or find it."""
+        """Record an operation, or return the existing node."""
         key = (operation, *((one.place,) if isinstance(one, Node) else one for one in arguments))
         if key not in self._known:
             self._known[key] = Node(self, len(self.nodes), operation, arguments)
@@ -253,10 +252,10 @@ def evaluated(outputs: Sequence[Number], given: Mapping[Node, Any]) -> list[Any]
 
     Args:
         outputs: Nodes or constants.
-        given: Values of the inputs, and of other nodes that are known.
+        given: Values of the inputs, and of other known nodes.
 
     Returns:
-        Values of the outputs, of the kind of those given.
+        Values of the outputs, of the same kind.
     """
     values = {node.place: value for node, value in given.items()}
     needed, open_nodes = set(), [one for one in outputs if isinstance(one, Node)]

@@ -1,7 +1,7 @@
 """Dough, clay, cream: Hencky elasticity with Herschel-Bulkley flow.
 
-Below the yield stress the body is elastic. Above, shear stress grows with the rate of plastic flow: in simple
-shear by ``consistency * rate^exponent``; with exponent 1 that is a Bingham body of that viscosity.
+Below the yield stress the body is elastic. Above it, shear stress grows with the rate of plastic flow: in
+simple shear by ``consistency * rate^exponent``; with exponent 1 this is a Bingham body with this viscosity.
 """
 
 import math

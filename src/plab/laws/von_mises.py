@@ -8,8 +8,8 @@ The result equals that of an SVD of G.
 
 Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
 rounding: :mod:`plab.laws.algebra` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
-``d = atanh(Z)``, and in d. Where ``|Z|`` or J leave the range in which the series are exact to rounding,
-:mod:`plab.sim.spectral` takes over with an SVD.
+``d = atanh(Z)``, and in d. If ``|Z|`` or J are outside the range in which the series are exact to rounding,
+:mod:`plab.sim.spectral` uses an SVD.
 
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
 parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.laws.algebra.Series`.
@@ -104,7 +104,7 @@ def update(c, f, dt, mu, lam, yield_strain):
 
 
 YIELD_STRAIN_MAX = 1e30
-"""Stands for infinity, which would turn the unused branch into infinity times zero."""
+"""Represents infinity, which would give NaN in the unused branch."""
 
 
 def coefficients(youngs_modulus, poisson_ratio, yield_stress):

@@ -1,8 +1,8 @@
 """Chamfer term: squared distances between the particles and points of the target, both ways.
 
 ``mean_p min_k |x_p - y_k|^2 + mean_k min_p |x_p - y_k|^2`` over particles p and points k, which are the
-centroids of equal shares of the target's mass. Unlike density and SDF it also pulls particles to parts of the
-target that none is near to.
+centroids of equal shares of the target's mass. Unlike density and SDF, it also attracts particles to parts of
+the target without particles nearby.
 """
 
 import numpy as np
@@ -17,11 +17,10 @@ POINTS = 500
 """Points of a target."""
 
 FAR = 1e9
-"""Squared distance of the nearest particle before any was looked at [domain units^2]."""
+"""Initial value for the squared distance of the nearest particle [domain units^2]."""
 
 EQUAL = 1.0 + 1e-6
-"""Squared distances within this factor of the least count as the least: its own may round otherwise when it
-is computed again."""
+"""Tolerance factor for the least squared distance, because recomputing it may round differently."""
 
 
 class Chamfer(ParticleTerm):
@@ -48,7 +47,7 @@ class Chamfer(ParticleTerm):
 
     @ti.func
     def measure(self, e, x, v):
-        """The particle's share; notes where it is the nearest one."""
+        """Return the particle's contribution; record where it is the nearest particle."""
         least = ti.cast(FAR, self.sim.real)
         for k in range(POINTS):
             d = (x - self.points[e, k]).norm_sqr()

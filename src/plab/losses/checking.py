@@ -26,24 +26,23 @@ def check_gradient(
 ) -> dict[str, float]:
     """Compare a term's gradient with central differences of its measure, in float64 at a disturbed state.
 
-    The targets are random, particles move, manipulators are moved and turned. Where a term has a kink, such
-    as where mass and target mass are equal, a difference across it is no derivative; random states are not
-    close to any.
+    The targets are random, particles move, and manipulators are displaced and rotated. Differences across
+    kinks of a term, such as equal mass and target mass, are invalid, but random states are not close to
+    kinks.
 
     Args:
         term: A new term, of any kind of :mod:`plab.losses.term`.
-        scenes: Scenes as for :class:`plab.sim.Simulator`; small ones do.
+        scenes: Scenes as for :class:`plab.sim.Simulator`; small ones suffice.
         device: ``cpu`` or ``cuda``.
         directions: Random directions per part of the state.
-        seed: Seed of all that is random.
+        seed: Seed of all random numbers.
 
     Returns:
         Largest error by part of the state: positions ``x``, velocities ``v``, and the variable components of
-        ``poses``. Relative to the largest derivative along a direction; 0 where the term does not depend on
-        the part.
+        ``poses``. Relative to the largest directional derivative; 0 if the term does not depend on the part.
 
     Raises:
-        ValueError: If the measure does not depend on the state at all: there is nothing to check.
+        ValueError: If the measure does not depend on the state.
     """
     term.weight = term.weight or 1.0
     rng = np.random.default_rng(seed)
@@ -69,7 +68,7 @@ def check_gradient(
         )
     errors = {}
     for part, pairs in slopes.items():
-        # A part that plays no role has differences that are rounding alone.
+        # Differences of irrelevant parts are rounding errors.
         scale = max(1e-6 * largest, *(abs(slope) for pair in pairs for slope in pair))
         errors[part] = max(abs(a - b) for a, b in pairs) / scale
     return errors
@@ -82,7 +81,7 @@ def _free(scene: Scene) -> np.ndarray:
 
 
 def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:
-    """The start, with particles that move, and manipulators moved and turned."""
+    """The initial state with moving particles, and displaced and rotated manipulators."""
     rest = simulator.state()
     poses = rest.poses.copy()
     poses[..., :3] += rng.normal(scale=DISTURBANCE, size=poses[..., :3].shape)

@@ -1,8 +1,9 @@
 """Contact terms: three functions of the distances d_p between a moving manipulator and all particles p.
 
 * ``nearest``: ``D^2``, D the distance of the nearest particle, and its gradient.
-* ``all``: the same measure; as gradient ``2 D sum grad d_p`` over all particles outside. No function has it.
-* ``soft``: ``D^2``, D the mean of the d_p with weights ``1 / (1 + 1e4 d_p^2)``, and its gradient.
+* ``all``: the same measure; as gradient ``2 D sum grad d_p`` over all particles outside. It is not the
+gradient of any function. * ``soft``: ``D^2``, D the mean of the d_p with weights ``1 / (1 + 1e4 d_p^2)``, and
+its gradient.
 
 Distances are 0 inside a manipulator. Each term is summed over the moving manipulators.
 """
@@ -21,7 +22,7 @@ release."""
 
 
 class NearestContact(DistanceTerm):
-    """Squared distance to the nearest particle; of several at the same distance the first."""
+    """Squared distance to the nearest particle; ties are broken by order."""
 
     name = "contact"
     label = "squared distances of the moving manipulators to the nearest particle"
@@ -65,10 +66,10 @@ class NearestContact(DistanceTerm):
 
 
 class AllContact(NearestContact):
-    """The nearest distance, with the adjoint of the nearest particle given to every particle outside.
+    """The nearest distance; in the adjoint every particle outside receives the derivative of the nearest one.
 
-    The PlasticineLab release differentiates an atomic minimum as if it were an addition, which does this. It
-    guides a manipulator towards the whole body, ten thousand times as strongly as the gradient would.
+    This results from the release's differentiation of an atomic minimum as an addition. It attracts a
+    manipulator to the whole body, ten thousand times as strongly as the true gradient.
     """
 
     label = f"{NearestContact.label}; gradient summed over all particles"
@@ -84,7 +85,7 @@ class AllContact(NearestContact):
 
 
 class SoftContact(DistanceTerm):
-    """Square of a weighted mean of the distances, in which near particles count most."""
+    """Squared weighted mean of the distances, dominated by near particles."""
 
     name = "contact"
     label = "squared soft minima of the moving manipulators' distances to the particles"

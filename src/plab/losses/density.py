@@ -1,4 +1,4 @@
-"""Density term, ``sum |S - S*|``: mass where the target has none, and the reverse."""
+"""Density term, ``sum |S - S*|``: excess and missing mass."""
 
 import numpy as np
 
@@ -9,21 +9,21 @@ __all__ = ["Density"]
 
 
 class Density(NodeTerm):
-    """Sum over the grid of the distance between mass S and target mass S*, as in the paper."""
+    """Sum over the grid of the absolute difference of mass S and target mass S*, as in the paper."""
 
     name = "density"
     label = "sum over the grid of |mass - target mass|"
     unit = "mass"
 
     def attach(self, sim) -> None:
-        """Share the target's mass tensor, and keep its sum."""
+        """Request the target's mass tensor, and compute its sum."""
         super().attach(sim)
         self.target = sim.reference("mass")
         self.total = sim.share(ti.field(ti.f64, shape=sim.batch))
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Sum the targets' masses, the measure of an empty grid."""
-        # A target of the release may have negative ones.
+        # Targets of the release may have negative masses.
         self.sim.write(self.total, np.abs(mass).sum(axis=(1, 2, 3)))
 
     @ti.func

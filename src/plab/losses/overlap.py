@@ -1,4 +1,4 @@
-"""Overlap of mass and target, from which scores are computed; measured, but not part of the loss."""
+"""Overlap of mass and target for scores; measured, but not part of the loss."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ class Overlap(NodeTerm):
     weighted = False
 
     def attach(self, sim) -> None:
-        """Share the target's mass tensor; without a target there is no IoU, it is NaN."""
+        """Request the target's mass tensor; without a target the IoU is NaN."""
         super().attach(sim)
         self.target = sim.reference("mass")
         self._scale = Constants(np.full((2, sim.batch), np.nan))

@@ -1,4 +1,4 @@
-"""Distance term, ``sum sdf* S``: mass times its distance to the target."""
+"""Distance term, ``sum sdf* S``: mass times distance to the target."""
 
 from plab.losses.term import NodeTerm
 from plab.sim.compiler import ti
@@ -14,7 +14,7 @@ class Sdf(NodeTerm):
     unit = "mass x domain units"
 
     def attach(self, sim) -> None:
-        """Share the distances to the target."""
+        """Request the distances to the target."""
         super().attach(sim)
         self.target_sdf = sim.reference("sdf")
 

@@ -1,8 +1,8 @@
 """Base classes of the terms of the loss: functions of grid nodes, of particles, or of distances.
 
-A term is a class with a few functions that Taichi compiles into the simulator's kernels, for the CPU and for
-CUDA alike. It depends on the state alone: masses of nodes, positions and velocities of particles, distances
-to manipulators. The simulator sums up, forward and backward.
+A term is a class with a few functions that Taichi compiles into the simulator's kernels, for CPU and CUDA. It
+depends only on the state: masses of nodes, positions and velocities of particles, distances to manipulators.
+The simulator computes the sums and their adjoints.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ class Term:
         label: Description of the measure, for reports.
         unit: Unit of the measure, for reports.
         weight: Weight in the loss; with 0 the term is not compiled.
-        weighted: Part of the loss; if not, the term is measured only, and has no gradient.
+        weighted: Whether it is part of the loss; otherwise it is only measured, without gradient.
         sim: The simulator's kernels, after :meth:`attach`: numbers such as ``batch``, ``particles``, ``n``,
             ``dx``, ``mass`` (of a particle) and ``real``, Taichi's type of the simulation's numbers.
     """
@@ -32,20 +32,20 @@ class Term:
     weighted: bool = True
 
     def attach(self, sim) -> None:
-        """Become part of a simulator: the place to allocate fields. Called once."""
+        """Attach the term to a simulator and allocate fields. Called once."""
         self.sim = sim
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Take note of the targets.
+        """Process new targets.
 
         Args:
-            mass: Target mass tensors as the simulation holds them, shape [batch, n, n, n], float64.
+            mass: Target mass tensors, shape [batch, n, n, n], float64.
             sdf: Distance of each node to the target [domain units], same shape.
         """
 
 
 class NodeTerm(Term):
-    """A sum over the nodes of the mass tensor, of a function of each node's mass."""
+    """Sum of a function of mass over the nodes of the mass tensor."""
 
     @ti.func
     def empty(self, e):
@@ -54,7 +54,7 @@ class NodeTerm(Term):
 
     @ti.func
     def measure(self, e, node, mass):
-        """Return the share of a node of environment ``e``, beyond that of an empty node.
+        """Return the contribution of a node of environment ``e``, minus that of an empty node.
 
         ``node`` is its index along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry in
         fields of n^3 numbers per environment. ``mass`` is its mass, positive; with the release's floor it may
@@ -64,21 +64,22 @@ class NodeTerm(Term):
 
     @ti.func
     def slope(self, e, node, mass):
-        """Derivative of :meth:`measure` by the mass."""
+        """Derivative of :meth:`measure` with respect to the mass."""
         return 0.0 * mass
 
 
 class ParticleTerm(Term):
-    """A sum over the particles, of a function of each one's position and velocity."""
+    """Sum of a function of position and velocity over the particles."""
 
     @ti.func
     def measure(self, e, x, v):
-        """Return the share of a particle of environment ``e`` at ``x`` [domain units] with velocity ``v``."""
+        """Return the contribution of a particle of environment ``e`` at ``x`` [domain units] with velocity
+        ``v``."""
         return 0.0 * x[0]
 
     @ti.func
     def gradient(self, e, x, v):
-        """Derivatives of the term by position and velocity, two 3-vectors."""
+        """Derivatives of the term with respect to position and velocity, two 3-vectors."""
         return 0.0 * x, 0.0 * v
 
     @ti.func
@@ -88,7 +89,7 @@ class ParticleTerm(Term):
 
 
 class DistanceTerm(Term):
-    """A sum over the moving manipulators, of a function of their signed distances from all particles.
+    """Sum of a function of the signed distances from all particles over the moving manipulators.
 
     The distances of a manipulator are accumulated in a pair of float64, the tally; tallies of groups of
     particles are joined.
@@ -112,15 +113,15 @@ class DistanceTerm(Term):
 
     @ti.func
     def join(self, tally, other):
-        """Tally of two parts of the particles; the result must not depend on which is which."""
+        """Joint tally of two groups of particles; it must be symmetric."""
         return tally + other
 
     @ti.func
     def measure(self, tally):
-        """Return the share of a manipulator, float64."""
+        """Return the contribution of a manipulator, float64."""
         return 0.0 * tally[0]
 
     @ti.func
     def slope(self, tally, d, particle):
-        """Derivative of :meth:`measure` by the distance of a particle, float64."""
+        """Derivative of :meth:`measure` with respect to the distance of a particle, float64."""
         return 0.0 * tally[0]

@@ -1,6 +1,6 @@
 """Pictures of scenes and rollouts: :class:`Renderer`, and ``plab render`` on the command line.
 
-PyVista, which draws, is optional: ``pip install 'plab[render]'``. docs/rendering.md has the details.
+PyVista, for rendering, is optional: ``pip install 'plab[render]'``. docs/rendering.md has the details.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Cameras that just hold a scene, from the direction that shows its task best."""
+"""Cameras that fit a scene, from a suitable direction for each task."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plab.scenes import Camera, Scene, sample_particles
 
 @dataclass(frozen=True)
 class View:
-    """The direction from which a task is looked at.
+    """The viewing direction for a task.
 
     Attributes:
         azimuth: Angle around the y axis [degrees]; 0 looks along -z, 90 along -x.
@@ -26,7 +26,7 @@ class View:
 
 
 DEFAULT_VIEW = View(20.0, 30.0)
-"""View of tasks that :data:`VIEWS` does not have."""
+"""Default view of tasks."""
 
 VIEWS: dict[str, View] = {
     "Assembly": View(10.0, 25.0),
@@ -53,10 +53,10 @@ def scene_camera(
     x: np.ndarray | None = None,
     poses: np.ndarray | None = None,
 ) -> Camera:
-    """Return the camera that sees a scene, its shadows on the floor and its target.
+    """Return a camera with a scene, its shadows on the floor and its target in view.
 
     Args:
-        scene: The scene; its name chooses the direction of view from :data:`VIEWS`.
+        scene: The scene; its name selects the view from :data:`VIEWS`.
         target_mass: Mass tensor of the target, shape [n, n, n].
         size: Width and height of the pictures [pixels].
         x: Positions of particles [domain units], shape [..., 3]; those at t = 0 if None.
@@ -77,8 +77,8 @@ def scene_camera(
     return fit_camera(points, VIEWS.get(scene.name, DEFAULT_VIEW), size[0] / size[1])
 
 
-_MARGIN = 1.08  # factor on the distance from which everything just fits
-_ROUNDS = 4  # of centring; each leaves a few percent of the error before it
+_MARGIN = 1.08  # margin factor of the camera distance
+_ROUNDS = 4  # iterations of centring; each reduces the error to a few percent
 
 
 def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:

@@ -1,4 +1,4 @@
-"""Requirements of drawing: packages, and an OpenGL that works without a screen."""
+"""Requirements of rendering: packages, and off-screen OpenGL."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RenderError(PlabError, RuntimeError):
 
 
 def require_graphics() -> None:
-    """Raise :class:`RenderError` if something that drawing needs is missing."""
+    """Raise :class:`RenderError` if a requirement of rendering is missing."""
     reason = missing_graphics()
     if reason:
         raise RenderError(reason)
@@ -30,9 +30,9 @@ def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) ->
     """Raise :class:`RenderError` if a package is missing.
 
     Args:
-        who_needs: Start of the message: ``pictures need``.
-        packages: Names for readers by those that are imported.
-        extra: The extra that installs them.
+        who_needs: Beginning of the message: ``pictures need``.
+        packages: Display names by module.
+        extra: Extra that installs them.
     """
     for package, name in packages.items():
         if find_spec(package) is None:
@@ -52,7 +52,7 @@ def missing_graphics() -> str | None:
         return str(error)
     if sys.platform.startswith("linux") and _WINDOW not in os.environ:
         if not _egl_works():
-            # VTK would end the process with a segmentation fault.
+            # Otherwise VTK ends the process with a segmentation fault.
             return (
                 "pictures need OpenGL through EGL, which does not work here; on Debian and Ubuntu: "
                 "apt-get install libegl1 libgl1-mesa-dri"

@@ -1,4 +1,5 @@
-"""Picture files: strips of start, target and end, films, and sets of both for the page of results."""
+"""Picture files: strips of initial state, target and final state, films, and sets of both for the results
+page."""
 
 from __future__ import annotations
 
@@ -26,10 +27,10 @@ from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError
 
 STEPS_PER_SECOND = 20
-"""Environment steps that a film shows in a second, whatever the number of its frames."""
+"""Environment steps per second of a film."""
 
 SUFFIXES = (".png", ".gif", ".mp4")
-"""Suffixes of the files that can be written: a strip of pictures, or a film."""
+"""Suffixes of supported files: a strip of pictures, or a film."""
 
 _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
@@ -46,11 +47,11 @@ _RENDER_ERRORS = (RenderError, ConfigError, SceneError, TargetError, DeviceError
 
 
 Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
-"""Result files and whether each is to have a film, by the name of its pictures, by folder."""
+"""By folder and picture name: result file, and whether to make a film."""
 
 
 def check_output(path: Path) -> None:
-    """Refuse a kind of file that cannot be written, before anything is computed.
+    """Raise an error for unsupported files, before anything is computed.
 
     Raises:
         RenderError: If the suffix is not supported, or a required package is not installed.
@@ -82,7 +83,7 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
 def save_set(
     recordings: Mapping[str, RecordedRollout], folder: Path, size: tuple[int, int], filmed: Collection[str]
 ) -> None:
-    """Write pictures of several rollouts of one configuration, all seen by the same camera.
+    """Write pictures of several rollouts of one configuration with a common camera.
 
     Writes ``start.webp`` and ``target.webp``, for each rollout its last state as ``<name>.webp``, and of
     some, where imageio-ffmpeg is installed, a film ``<name>.mp4``.
@@ -91,7 +92,7 @@ def save_set(
         recordings: The rollouts by name.
         folder: Folder to write to.
         size: Width and height of a frame [pixels]; even numbers.
-        filmed: Names of those that have a film.
+        filmed: Names of the rollouts with a film.
 
     Raises:
         RenderError: If a file cannot be written.
@@ -183,7 +184,7 @@ def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tup
 
 
 def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
-    """Return the camera that sees a whole rollout."""
+    """Return a camera with a whole rollout in view."""
     x, poses = recording.x[[0, -1]], recording.poses[::5]
     return scene_camera(recording.scene, recording.target_mass, size, x, poses)
 
@@ -259,7 +260,8 @@ def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
     """Return a picture with a common palette for all pictures, each of shape [row, column, 3]."""
     pixels = np.concatenate([picture.reshape(-1, 3) for picture in pictures])
     seen, counts = np.unique(pixels, axis=0, return_counts=True)
-    # By the root of how often a colour is seen: paper is everywhere, yet clay needs its shades, too.
+    # Weighted by the square root of the frequency, because the background dominates, but plasticine needs
+    # many shades.
     weighted = np.repeat(seen, np.ceil(np.sqrt(counts)).astype(int), axis=0)
     return Image.fromarray(weighted[None]).quantize(colors, method=Image.Quantize.MEDIANCUT, kmeans=1)
 
@@ -277,12 +279,12 @@ def _write(sheet: Image.Image, text: str, center: tuple[int, int], size: int) ->
 
 
 def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
-    """Draw runs of many configurations, see :func:`save_set`.
+    """Render runs of many configurations, see :func:`save_set`.
 
     Args:
         wanted: For each configuration the folder of its pictures, which must not exist and appears when it is
             complete; and the pictures to draw.
-        drawn: Is called when a folder is complete.
+        drawn: Called when a folder is complete.
 
     Raises:
         RenderError: If rendering is not possible, a file cannot be written, or runs cannot be replayed; all
@@ -321,7 +323,7 @@ def draw_strip(path: Path, picture: Path) -> None:
         picture: PNG file to write.
 
     Raises:
-        RenderError: If this computer cannot draw, or the run cannot be replayed.
+        RenderError: If rendering is not possible, or the run cannot be replayed.
     """
     require_graphics()
     try:
@@ -331,8 +333,8 @@ def draw_strip(path: Path, picture: Path) -> None:
 
 
 def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
-    """Return the folders by task, those with films first: configurations of one task share a simulator, and
-    its compilation."""
+    """Return the folders by task, those with films first; configurations of one task share a compiled
+    simulator."""
     groups: dict[str, list[Path]] = defaultdict(list)
     for folder in sorted(wanted, key=lambda folder: -sum(film for _, film in wanted[folder].values())):
         groups[folder.name.rpartition("-v")[0]].append(folder)
@@ -340,7 +342,7 @@ def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
 
 
 def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
-    """Replay all runs of one task; those of the same settings share a simulator."""
+    """Replay all runs of one task; runs with the same settings share a simulator."""
     alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
     for folder, files in group.items():
         for name, (path, _) in files.items():
@@ -358,7 +360,7 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
 
 @contextmanager
 def _complete_or_not(folder: Path) -> Iterator[Path]:
-    """Give a folder to write to, which takes its place only if nothing goes wrong."""
+    """Yield a temporary folder that replaces the destination on success."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder.parent))

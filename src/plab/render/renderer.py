@@ -1,4 +1,4 @@
-"""Pictures of one scene: clay, manipulators, floor and the target's ghost, drawn with PyVista."""
+"""Rendering of one scene with PyVista: plasticine, manipulators, floor and translucent target."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INK = "#453f3b"
 BODY_COLORS = ("#d0694a", "#dda53f", "#8a9d5b", "#c67884", "#8e5f7d")
 """Colours of a scene's bodies, in order."""
 
-# Direction towards the light (right, up, to the camera), strength, colour. The first throws the shadows.
+# Direction towards the light (right, up, to the camera), strength, colour. The first light casts the shadows.
 _LIGHTS = (
     ((-0.35, 1.0, 0.25), 0.74, "#fff6ea"),
     ((0.4, 0.4, 1.0), 0.48, "#eef2ff"),
@@ -53,7 +53,7 @@ _LINE_OPACITY = 0.16
 
 
 class Renderer:
-    """Draws pictures of one scene.
+    """Renderer of one scene.
 
     An off-screen window is reused between pictures; only moved objects are updated.
 
@@ -72,8 +72,8 @@ class Renderer:
         """Set the scene up.
 
         Args:
-            scene: The scene. Its particles must start where :func:`plab.scenes.sample_particles` puts them,
-                or surfaces are rough.
+            scene: The scene. Initial particle positions must be those of
+                :func:`plab.scenes.sample_particles`, otherwise surfaces are rough.
             target_mass: Mass tensor of the target, shape [n, n, n]; None draws no target.
             size: Width and height of the pictures [pixels].
             camera: Camera of the pictures; :func:`plab.render.camera.scene_camera` if None.
@@ -102,7 +102,7 @@ class Renderer:
             self._target = Target(plotter, _layer_on_top(plotter), scene, target_mass, self.camera)
 
     def frame(self, x: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Draw a state, with the target's ghost in it, also inside plasticine.
+        """Render a state with the translucent target, also inside plasticine.
 
         Manipulators become translucent in front of plasticine.
 
@@ -135,7 +135,7 @@ class Renderer:
         return self._draw(shown, clouds)
 
     def target(self, poses: np.ndarray) -> np.ndarray:
-        """Draw the target as if it were plasticine, and the manipulators that cannot move.
+        """Render the target as plasticine, with the static manipulators.
 
         Args:
             poses: As for :meth:`frame`.
@@ -160,11 +160,11 @@ class Renderer:
         """Free the window; closing twice is allowed."""
         if self._plotter is not None:
             self._plotter.close()
-            # PyVista complains about plotters that are still there when Python ends.
+            # PyVista reports errors for plotters that exist at interpreter shutdown.
             self._plotter = None
 
     def _place(self, poses: np.ndarray) -> None:
-        """Put the manipulators at their poses, shape [manipulator, 8]."""
+        """Set the poses of the manipulators, shape [manipulator, 8]."""
         self._window()
         if np.shape(poses) != (len(self._manipulators), 8):
             raise ArgumentError(f"poses have shape {np.shape(poses)}, not {(len(self._manipulators), 8)}")
@@ -204,7 +204,7 @@ class Renderer:
 
 
 def _layer_on_top(plotter: pv.Plotter) -> vtkRenderer:
-    """Add a layer that is drawn over all else of a window, seen by the same camera."""
+    """Add a layer on top of a window, with the same camera."""
     window, layer = plotter.render_window, vtkRenderer()
     layer.SetLayer(window.GetNumberOfLayers())
     window.SetNumberOfLayers(layer.GetLayer() + 1)
@@ -215,7 +215,7 @@ def _layer_on_top(plotter: pv.Plotter) -> vtkRenderer:
 
 
 def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:
-    """Add the lights; return the direction, shape [3], towards the one that throws shadows."""
+    """Add the lights; return the direction, shape [3], towards the one that casts shadows."""
     right, up = camera.axes()[0], np.array([0.0, 1.0, 0.0])
     axes = np.stack([right, up, np.cross(right, up)])
     for toward, strength, color in _LIGHTS:
@@ -242,7 +242,7 @@ class PlasticineSurface:
         """Set the shape, with ambient light."""
         if mesh.n_points:
             light = ambient.at(mesh.points, mesh.point_normals)[:, None]
-            # Light that goes back and forth between walls of clay takes on more of their colour.
+            # Interreflections between walls of plasticine intensify its colour.
             mesh["color"] = (255 * light * (self._color / 255) ** (1.5 - 0.5 * light)).astype(np.uint8)
             mesh.set_active_scalars("color")
         self.actors[0].mapper.SetInputData(mesh)
@@ -253,7 +253,7 @@ class Rigid:
 
     Attributes:
         actors: Actors of its parts.
-        cloud: Points that throw its shadow, at the last pose.
+        cloud: Points that cast its shadow, at the last pose.
         moves: True if actions move it.
     """
 
@@ -266,7 +266,7 @@ class Rigid:
         self.actors = [plotter.add_mesh(part_mesh(part), **look) for part in self._parts]
 
     def place(self, pose: np.ndarray) -> None:
-        """Put it at a pose, shape [8]; it is opaque there."""
+        """Set the pose, shape [8], and make it opaque."""
         matrices = [pose_matrix(pose, part.side) for part in self._parts]
         for actor, matrix in zip(self.actors, matrices, strict=True):
             actor.user_matrix = matrix
@@ -284,13 +284,13 @@ class Rigid:
 
 
 class Target:
-    """The target, as a ghost and as a solid.
+    """The target, translucent and solid.
 
     Attributes:
         actors: Actors of both.
         mesh: Its surface.
-        cloud: Points that throw the solid's shadow.
-        ghost: Actors of the ghost: outside plasticine, and inside.
+        cloud: Points that cast the solid's shadow.
+        ghost: Translucent actors: outside plasticine, and inside.
         solid: The solid.
     """
 
@@ -304,7 +304,7 @@ class Target:
         self.solid = PlasticineSurface(plotter, self.mesh.copy(), TARGET_COLOR)
         toward = camera.position - self.mesh.points
         facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
-        # Like a bubble: clear where it faces the camera, dense at the rim.
+        # Transparent where it faces the camera, denser at the silhouette.
         self._alpha = 255 * (0.2 + 0.6 * (1.0 - facing) ** 1.5)
         self._bubbles = [self.mesh.copy() for _ in range(2)]
         for bubble in self._bubbles:
@@ -340,7 +340,7 @@ class Target:
 
 
 class Floor:
-    """Paper with lines, ten to the domain unit, on which shadows fall."""
+    """Floor with grid lines, ten per domain unit, that receives shadows."""
 
     def __init__(self, plotter: pv.Plotter, paper: str, ink: str, pixel: float) -> None:
         """Add it to a window; its lines, of the colour of complete darkness too, are fitted to the size of a
@@ -356,7 +356,7 @@ class Floor:
         plotter.add_mesh(self._lines(0.5 * _LINE * pixel), color=ink, opacity=_LINE_OPACITY, lighting=False)
 
     def shade(self, light: np.ndarray) -> None:
-        """Let light fall on it, shape [z, x], as :func:`plab.render.shadows.floor_light` returns it."""
+        """Set the light, shape [z, x], from :func:`plab.render.shadows.floor_light`."""
         dark = _SHADOW * (1.0 - light)[..., None]
         colors = self._paper + dark * (self._ink - self._paper)
         image = pv.ImageData(dimensions=(*light.shape[::-1], 1))
@@ -369,7 +369,7 @@ class Floor:
         along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
         both = np.concatenate([along, along[:, ::-1]])
         corners = np.arange(len(both)).reshape(-1, 4)
-        # Just above the floor, which would hide them otherwise.
+        # Slightly above the floor, to be visible.
         return pv.PolyData(np.insert(both, 1, 4e-4, axis=1), faces=_quads(corners))
 
 
@@ -399,7 +399,7 @@ def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
 
 
 def _quads(corners: np.ndarray) -> np.ndarray:
-    """Return faces of four corners, shape [face, 4], as VTK has them."""
+    """Return quadrilateral faces, shape [face, 4], in VTK's format."""
     return np.insert(corners, 0, 4, axis=1).ravel()
 
 

@@ -1,4 +1,4 @@
-"""Rollouts to look at: a run's best actions, or the known demonstration, in the hard contact model."""
+"""Rollouts for rendering: a run's best actions, or a demonstration, in the hard contact model."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class RecordedRollout:
         task: Name of the task.
         variant: Name of the variant.
         scene: The scene.
-        target_mass: Mass tensor of the target, shape [n, n, n]; None if it cannot be made here.
-        x: Particle positions [domain units] at the start and after each step, shape [T + 1, particle, 3].
+        target_mass: Mass tensor of the target, shape [n, n, n]; None if it is not available.
+        x: Particle positions [domain units] initially and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
         scores: Scores of these states, shape [T + 1]; None without a target, or if not requested.
         v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
@@ -68,11 +68,11 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
 
 
 def stored(path: Path) -> tuple[Config, np.ndarray]:
-    """Return the configuration, as far as a replay needs it, and the best actions of a result file.
+    """Return the configuration for a replay, and the best actions of a result file.
 
     Raises:
         plab.results.ResultsError: If the file cannot be read.
-        RenderError: If it has no actions yet, or some that its task does not take.
+        RenderError: If it has no actions yet, or they do not fit its task.
     """
     run = read(path)
     if run.best_actions is None:
@@ -85,7 +85,7 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
             task=_section(run.config["task"], TaskConfig),
             protocol=_section(run.config["protocol"], ProtocolConfig),
             sim=_section(run.config["sim"], SimConfig),
-            # A target that came from a file of the user's is not in the result.
+            # Targets from user files are not in results.
             targets=_section(run.config["targets"], TargetsConfig),
         )
         components = build_scene(cfg).action_dim
@@ -102,7 +102,7 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
 
 @functools.cache
 def _defaults() -> Config:
-    """Return plab's own configuration, which takes a third of a second to compose."""
+    """Return plab's default configuration, cached because composition takes a third of a second."""
     return load_config()
 
 
@@ -112,12 +112,12 @@ def _section(values: dict[str, Any], kind: type[Section]) -> Section:
 
 
 def demonstration(cfg: Config) -> np.ndarray:
-    """Return the best actions that are known for a configuration, or an episode of zeros, shape [T, A].
+    """Return the best known actions for a configuration, or zeros, shape [T, A].
 
     Raises:
         RenderError: If the known actions do not fit the scene.
     """
-    # Imported here: it reads tables, which the replay of a result does not need.
+    # Imported here, because replaying a result does not need its tables.
     from plab.demonstrations import known_actions
 
     scene, actions = build_scene(cfg), known_actions(cfg)
@@ -135,18 +135,18 @@ def demonstration(cfg: Config) -> np.ndarray:
 
 
 def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
-    """Run actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
+    """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
     return record_all([cfg], actions[None])[0]
 
 
 def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = True) -> list[RecordedRollout]:
-    """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene; their
-    scores are worked out if ``scored``."""
+    """Simulate actions in [-1, 1], shape [batch, T, A], in configurations with one kind of scene; with
+    ``scored`` compute scores."""
     return _recordings(cfgs, Problem(cfgs), actions, scored=scored)
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
-    """Run actions as :func:`record` does, and keep velocities and deformation gradients.
+    """As :func:`record`, with velocities and deformation gradients.
 
     A target that cannot be generated, for example because its file is missing, is left out, with a message.
     """
@@ -171,13 +171,13 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
 
 
 def starts(cfgs: Sequence[Config]) -> list[RecordedRollout]:
-    """Return recordings of no step, of configurations of one kind of scene."""
+    """Return rollouts without steps, for configurations with one kind of scene."""
     problem = Problem(cfgs)
     return _recordings(cfgs, problem, np.zeros((len(cfgs), 0, problem.simulator.action_dim)))
 
 
 def _states(simulator: Simulator, actions: np.ndarray) -> Iterator[State]:
-    """Run actions, shape [batch, T, A], from the start; yield the first state and that after each step."""
+    """Simulate actions, shape [batch, T, A]; yield the initial state and the state after each step."""
     simulator.set_contact("hard")
     simulator.reset()
     yield simulator.state()

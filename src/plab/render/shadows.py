@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from plab.scenes import Camera
 
 FLOOR_LOW = -0.4
-"""Lowest x and z of the floor that can lie in shadow [domain units]."""
+"""Lowest x and z of the shadowed part of the floor [domain units]."""
 
 FLOOR_EDGE = 1.8
 """Edge of that square [domain units]."""
@@ -29,21 +29,21 @@ _CELL = 0.02  # of the grid of covered space
 _BLUR = 1.1  # in cells
 _CELLS_AROUND = 5
 _OPACITY = 1.5
-_SAMPLE_DISTANCE = 0.03  # distance from a surface at which its light is measured
+_SAMPLE_DISTANCE = 0.03  # distance from a surface at which its light is sampled
 _FLAT_OCCLUSION = 0.06  # occlusion of a flat surface by itself
 _STRENGTH = 1.1
 _VIEW_CELL = 0.02  # of the visibility picture [domain units at the camera's target]
-_CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
+_CONTACT = 0.1  # distance within which a manipulator acts on plasticine [domain units]
 _DARKEST = 0.25
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points that stand for a body or a manipulator.
+    """Point cloud of a body or a manipulator.
 
     Attributes:
         points: Positions [domain units], shape [point, 3].
-        area: Area that each covers [domain units^2].
+        area: Area per point [domain units^2].
     """
 
     points: np.ndarray
@@ -51,7 +51,7 @@ class Cloud:
 
 
 def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
-    """Return how much light reaches the floor.
+    """Return the light on the floor.
 
     Args:
         clouds: Bodies and manipulators above it.
@@ -82,7 +82,7 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
 
 
 def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
-    """Return the share of an object's area in the picture behind which there is plasticine that it touches.
+    """Return the fraction of an object's area in the picture that occludes plasticine in contact with it.
 
     Args:
         front: Points of the object [domain units], shape [point, 3].
@@ -103,10 +103,10 @@ def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
 
 
 class AmbientLight:
-    """The light from all sides, which does not reach into corners: ambient occlusion."""
+    """Ambient occlusion: light from all sides, reduced in corners."""
 
     def __init__(self, clouds: Sequence[Cloud]) -> None:
-        """Find out which space is covered; the space below the floor is."""
+        """Compute the occupied space, including the space below the floor."""
         points = np.concatenate([cloud.points for cloud in clouds])
         self._low = points.min(axis=0) - _CELLS_AROUND * _CELL
         shape = np.ceil((points.max(axis=0) - self._low) / _CELL).astype(int) + _CELLS_AROUND + 1

@@ -1,4 +1,4 @@
-"""Meshes of the manipulators, in their own frames and at their poses. Plain NumPy."""
+"""Meshes of manipulators, in their own frames and at their poses. Plain NumPy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Part:
     side: float = 0.0
 
     def scatter(self, area: float) -> np.ndarray:
-        """Return points spread over the surface, one for each such area, shape [point, 3]."""
+        """Return points distributed over the surface, one per given area, shape [point, 3]."""
         corners = self.vertices[self.faces]
         triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
         origin, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]

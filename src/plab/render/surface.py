@@ -1,9 +1,9 @@
 """Smooth surfaces of plasticine as level sets of scalar fields of its particles.
 
-A body's particles are drawn at random, so their plain density is grainy and its level set lumpy. Each
-particle therefore gets a weight, chosen once such that the weighted density of the undeformed body is its
-true shape, smoothed by the kernel. Particles keep their neighbours while plasticine flows, hence the surface
-stays smooth.
+Particles are sampled at random, so their plain density is noisy and its level set rough. Each particle
+therefore has a fixed weight such that the weighted density of the undeformed body equals its exact shape,
+smoothed by the kernel. Particles mostly keep their neighbours while plasticine flows, so the surface stays
+smooth.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ CELL = 0.9
 """Grid spacing of the fields [mean particle spacings]."""
 
 WEIGHT_ITERATIONS = 8
-"""Corrections of the particles' weights."""
+"""Number of corrections of the particle weights."""
 
 TARGET_BLUR = 0.85
-"""Standard deviation of the blur that evens out a target's random samples [grid spacings of the scene]."""
+"""Standard deviation of the blur that smooths the random samples of a target [grid spacings of the scene]."""
 
 _REACH = 3.0  # radius of the kernel, in standard deviations
 _MARGIN = 4  # nodes around a target, for the blur
-_NEARBY = 2.5  # width of the neighbourhood in which a target's density is looked up, in half nodes
-_TARGET_LEVEL = 0.7  # of that density, which is lower than inside: exact where the surface is flat
+_NEARBY = 2.5  # width of the neighbourhood for the density of a target, in half nodes
+_TARGET_LEVEL = 0.7  # relative to this density; exact for flat surfaces
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class BodySurface:
 
 
 def body_slices(scene: Scene) -> list[slice]:
-    """Return where each body's particles are in arrays of all particles."""
+    """Return the slices of each body's particles in arrays of all particles."""
     ends = np.cumsum([body.particles for body in scene.bodies])
     return [slice(int(end) - body.particles, int(end)) for body, end in zip(scene.bodies, ends, strict=True)]
 
@@ -96,7 +96,7 @@ def body_surfaces(scene: Scene) -> list[BodySurface]:
 def target_field(scene: Scene, mass: np.ndarray) -> Field:
     """Return the scalar field of a target.
 
-    The level is a fraction of the density nearby, because bodies may be of different density.
+    The level is a fraction of the local density, because bodies may differ in density.
 
     Args:
         scene: The scene.
@@ -105,7 +105,7 @@ def target_field(scene: Scene, mass: np.ndarray) -> Field:
     occupied = np.argwhere(mass > 0)
     low, high = occupied.min(axis=0), occupied.max(axis=0) + 1
     part = np.pad(mass[tuple(map(slice, low, high))], _MARGIN)
-    # Twice as fine: the blur fills in the nodes between.
+    # Twice as fine; the blur fills the intermediate nodes.
     fine = np.zeros(2 * np.array(part.shape) - 1, np.float32)
     fine[::2, ::2, ::2] = part / part.max()
     fine = gaussian_filter(fine, 2 * TARGET_BLUR, mode="constant")
@@ -125,9 +125,9 @@ class _Grid:
     """
 
     def __init__(self, x: np.ndarray, particle_spacing: float) -> None:
-        """Lay the grid around particles of shape [particle, 3] and their kernels."""
+        """Create the grid around particles, shape [particle, 3], and their kernels."""
         self.spacing = CELL * particle_spacing
-        # Spreading to the eight nodes of a cell has a width, too: variance 1/6.
+        # Linear interpolation to the eight nodes of a cell adds a variance of 1/6.
         self._blur = math.sqrt((KERNEL_WIDTH / CELL) ** 2 - 1 / 6)
         margin = (_REACH * self._blur + 2) * self.spacing
         self.origin = x.min(axis=0) - margin
@@ -161,7 +161,8 @@ class _Grid:
 
 
 def _occupied(body: Body, points: np.ndarray, spacing: float) -> np.ndarray:
-    """Share of the cells of a grid that a body fills at t = 0, by their centres, shape [..., 3]."""
+    """Return the fraction of each grid cell, given by its centre, shape [..., 3], that a body initially
+    fills."""
     if not isinstance(body, MeshBody):
         return np.clip(0.5 - _signed_distance(body, points) / spacing, 0.0, 1.0)
     unit = (points.reshape(-1, 3) - np.asarray(body.center)) / body.size[0]

@@ -26,15 +26,15 @@ _ERRORS = {
 _FLOOR = 1e-16
 """Smallest error that is drawn."""
 
-# Both are visible where one covers the other.
+# Both remain visible if they overlap.
 _LINES = {"float32": ("#D55E00", "-"), "float64": ("#0072B2", "--")}
 _MARKS = {"series": "o", "singular values": "s"}
 
 
 def work_precision(table: pd.DataFrame) -> Drawing | None:
-    """Draw run time against error, per task and contact model; None where nothing was varied.
+    """Draw run time against error, per task and contact model; None if nothing was varied.
 
-    Without run times, which a busy machine cannot measure, errors are drawn against substeps.
+    Without run times, errors are drawn against substeps.
 
     Args:
         table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.measured`.
@@ -48,7 +48,7 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
 
 
 def diagrams(table: pd.DataFrame) -> list[Drawing]:
-    """Draw run time against each kind of error, a figure per task and per axis that was varied.
+    """Draw run time against each kind of error, one figure per task and varied quantity.
 
     Args:
         table: Argument as for :func:`work_precision`, or rows not yet written.
@@ -88,7 +88,7 @@ def _diagram(name: str, table: pd.DataFrame, panels: Sequence[tuple[str, str, st
 
 
 def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str) -> None:
-    """Draw a line per precision and material, labelled with the values of the axis that was varied."""
+    """Draw a line per precision and material, labelled with the varied quantity."""
     named: set[int] = set()
     for (precision, material), rows in own.groupby(["precision", "material"], sort=False):
         (colour, dashes), mark = _LINES.get(precision, ("#777777", "-")), _MARKS.get(material, "^")

@@ -1,4 +1,5 @@
-"""Finished runs that may be averaged: runs of the suite that share all settings but seed and variant."""
+"""Selection of finished runs of the suite that may be averaged, because they differ only in seed and
+variant."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from plab.results.table import readable_rows, sources_of
 NAMES = ("task", "variant", "method", "seed")
 
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
-"""Configuration keys that the table of runs has as columns."""
+"""Configuration keys that are columns of the table of runs."""
 
 _SINGLE = ("seed_particles", *OBSERVATION_KEYS)
 """Top-level configuration keys that must agree within a mean."""
@@ -37,7 +38,7 @@ _IGNORED_KEYS = (
     "protocol.contact",
     "task.release",
 )
-"""Keys in which the runs of one mean may differ."""
+"""Keys that may differ within a mean."""
 
 
 class MixedRunsError(PlabError, ValueError):
@@ -46,7 +47,7 @@ class MixedRunsError(PlabError, ValueError):
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting that differs from plab's own.
+    """A setting that differs from plab's default.
 
     Attributes:
         key: Dotted key of the setting.
@@ -64,7 +65,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Runs:
-    """Finished runs, and which ones there should be.
+    """Finished runs, and the requested ones.
 
     Attributes:
         table: Table of :func:`plab.results.load`, a row per run.
@@ -73,11 +74,11 @@ class Runs:
         methods: Requested methods, in the order of tables.
         seeds: Requested seeds.
         unfinished: Number of requested runs that are not finished and not in ``table``.
-        under_way: Number of runs among them that a process computes at this moment.
+        under_way: Number of these runs in progress.
         others: Number of finished runs that were not requested.
-        set_aside: Number of finished runs with more changes to plab's own settings than others of the same
-            task and method.
-        unusual: Settings other than plab's own.
+        set_aside: Number of finished runs left out because others of the same task and method have fewer
+            changes to plab's settings.
+        unusual: Settings that differ from plab's.
         protocol: Name of their protocol.
         unreadable: Messages about files that could not be read.
         configs: Configurations of the runs, in the order of ``table``.
@@ -99,7 +100,8 @@ class Runs:
 
     @property
     def digest(self) -> str:
-        """SHA-256, in hex, over the runs' configurations, evaluations and times, wherever their files are."""
+        """SHA-256, in hex, of the runs' configurations, evaluations and times, independent of file
+        locations."""
         records = self.table.drop(columns="path").to_dict("records")
         lines = sorted(
             json.dumps({name: value for name, value in row.items() if value == value}, sort_keys=True)
@@ -109,7 +111,7 @@ class Runs:
 
     @property
     def present(self) -> list[str]:
-        """Methods that have runs, in the order of tables."""
+        """Methods with runs, in the order of tables."""
         names = set(self.table["method"])
         return [name for name in self.methods if name in names]
 
@@ -119,7 +121,7 @@ class Runs:
         return len(self.tasks) * len(self.variants) * len(self.seeds) * len(self.present)
 
     def left_out(self) -> list[str]:
-        """Return sentences on runs that are not in ``table``, and why; none where all are."""
+        """Return notes on runs missing from ``table``, with reasons."""
         counts = (
             (self.unfinished, "are not finished, hence not in them"),
             (self.others, "are of other tasks, variants, methods or seeds, hence not in them"),
@@ -152,16 +154,16 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
 
     Args:
         source: Folder of results, archive, or several of them.
-        chosen: Choice of runs; where it leaves something open: the suite's tasks and variants, the paper's
-            methods and seeds, and further methods and seeds that the results have.
+        chosen: Selection of runs; defaults: the suite's tasks and variants, the methods and seeds of the
+            paper and of the results.
         split: Setting whose values are treated as separate methods: a dotted key, ``folder`` or ``seed``;
             none if empty.
 
     Raises:
-        MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
+        MixedRunsError: If runs of one mean differ in their settings, or have the same seed.
         plab.errors.ArgumentError: If there are runs of several protocols, or no runs differ in
             ``split``.
-        plab.config.ConfigError: If no run can be of the choice.
+        plab.config.ConfigError: If the selection cannot match any run.
         plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     found, unreadable = readable_rows(source)
@@ -174,7 +176,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     if split:
         complete, names = _split(complete, split, sources_of(source))
         methods = [name for whole in methods for name in names.get(whole, [whole])]
-        # Each seed becomes a method of one run.
+        # Each seed is treated as a method with one run.
         seeds = seeds[:1] if split == "seed" else seeds
     protocol = one_protocol(row.config for row in complete)
     finished, unusual = _prefer_usual(complete, split)
@@ -220,10 +222,10 @@ def collect_ablation(
         key: Dotted key of the setting.
 
     Returns:
-        The task, variant and method with the most values; None where the setting never varies.
+        The task, variant and method with the most values; None if the setting never varies.
 
     Raises:
-        MixedRunsError: If they differ in more than that, or there are two of one seed.
+        MixedRunsError: If they differ in other settings, or have the same seed.
     """
     groups: dict[tuple[str, ...], dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in rows(source)[0]:
@@ -246,7 +248,8 @@ def collect_ablation(
 
 
 def _split(found: Sequence[Row], key: str, places: Sequence[Path]) -> tuple[list[Row], dict[str, list[str]]]:
-    """Return runs renamed where their method has several values of a setting, and the new names by method."""
+    """Return runs with methods renamed if they have several values of a setting, and the new names by
+    method."""
     texts = [_split_value(row, key, places) for row in found]
     methods = [row.values["method"] for row in found]
     new: dict[tuple[str, str], str] = {}
@@ -352,14 +355,14 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
 
 
 def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Setting]]:
-    """Keep, of each task and method, the runs with the fewest changes to plab's own settings.
+    """Select, for each task and method, the runs with the fewest changes to plab's settings.
 
     Args:
         found: The runs.
-        apart: Key that does not count as a change.
+        apart: Key that is not counted as a change.
 
     Returns:
-        These runs, and their settings that are not plab's own.
+        These runs, and their settings that differ from plab's.
     """
     changes = [
         {key: value for key, value in changed_settings(row.config).items() if key != apart} for row in found
@@ -401,7 +404,7 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
     own = {key: lookup(config, key) for key in expected if key not in by_variant}
-    # None where the run is older than the setting.
+    # None if the run is older than the setting.
     own = {key: None if value != value else value for key, value in own.items()}
     return {key: value for key, value in own.items() if value != expected[key]}
 
@@ -421,7 +424,7 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     own = shipped_file("task", task)
     if usual["protocol.numbers"] == "release":
         own = own | own.get("release", {})
-    # Bodies, manipulators, targets and variants may be changed at will.
+    # Bodies, manipulators, targets and variants may be changed freely.
     usual |= {f"task.{key}": value for key, value in own.items() if not isinstance(value, dict)}
     return {key: value for key, value in usual.items() if key not in _IGNORED_KEYS}
 

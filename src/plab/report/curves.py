@@ -52,7 +52,7 @@ def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
 def _panel(
     axes: Axes, runs: Runs, tables: Mapping[str, list[Rows]], axis: str, column: str, expected: int
 ) -> bool:
-    """Draw all methods' bands, and say in small print which lack runs; return whether there are any."""
+    """Draw the bands of all methods, with a note on missing runs; return whether there are any."""
     short = []
     for name in runs.methods:
         drawn = band(tables.get(name, []), axis, column)
@@ -67,7 +67,7 @@ def _panel(
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no runs", transform=axes.transAxes, va="center", **small)
     elif short:
-        # Between title and axes, where it hides no curve.
+        # Between title and axes, to not cover curves.
         lines = textwrap.wrap(", ".join(short), 40, break_on_hyphens=False)
         small |= {"textcoords": "offset points", "va": "bottom"}
         axes.annotate("\n".join(lines), (0.5, 1.0), (0, 2), "axes fraction", **small)
@@ -159,7 +159,7 @@ def _mean_curves(runs: Runs, series: Series, axis: str, column: str, label: str)
 
 
 def _per_task(runs: Runs, draw: Callable[[Axes, str], None], label: str) -> Figure:
-    """Return a figure with a panel per task, five in a row; a few have room to be larger."""
+    """Return a figure with one panel per task, five per row; panels are larger if there are few."""
     tasks, absent = _tasks_with_runs(runs)
     columns = min(len(tasks), 5)
     few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
@@ -176,7 +176,7 @@ def _per_task(runs: Runs, draw: Callable[[Axes, str], None], label: str) -> Figu
 
 
 def _tasks_with_runs(runs: Runs) -> tuple[list[str], list[str]]:
-    """Return the tasks that have runs, and those that have none, hence no panel."""
+    """Return the tasks with runs, and those without runs, which have no panel."""
     tasks, present = ordered_tasks(runs.tasks), set(runs.table["task"])
     return [task for task in tasks if task in present], [task for task in tasks if task not in present]
 
@@ -239,7 +239,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
 
 
 def agreement_plot(runs: Runs) -> list[Drawing]:
-    """Draw our mean score of each configuration against the paper's; nothing where no cell is in both."""
+    """Draw our mean score of each configuration against the paper's; none without common cells."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
@@ -280,7 +280,7 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
     for stress in stresses:
         drawn = band(groups[stress], "episodes", "reward")
         if drawn is not None:
-            # Not to the map's end, which is too light on white.
+            # Without the end of the colour map, which is too light on white.
             colour = to_hex(colormaps["viridis"](0.88 * float(scale(stress))))
             label = f"{stress:g}" + (f" ({drawn.count} runs)" if drawn.count > 1 else "")
             draw_band(panel, drawn, name, colour=colour, label=label)

@@ -27,10 +27,10 @@ _ENTRY = 0.72
 """Width of a legend's entry [inch]."""
 
 _STYLE = {
-    "pdf.fonttype": 42,  # TrueType: text stays text, and journals take it
+    "pdf.fonttype": 42,  # TrueType: embedded text, accepted by journals
     "ps.fonttype": 42,
     "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same everywhere
+    "font.sans-serif": ["DejaVu Sans"],  # included in matplotlib, so the same everywhere
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.spines.top": False,
@@ -53,7 +53,7 @@ class Drawing:
         name: Name of its files.
         figure: The figure.
         notes: Notes on the figure.
-        numbers: Numbers that it shows, if they are few.
+        numbers: Plotted numbers, if few.
     """
 
     name: str
@@ -64,14 +64,14 @@ class Drawing:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw in plab's style inside the ``with`` block; no window is opened."""
+    """Use plab's style inside the ``with`` block, without opening windows."""
     with matplotlib.rc_context(cast(Any, _STYLE)):
         yield
 
 
 def grid(rows: int, columns: int, *, width: float = 2.1, height: float = 1.7) -> tuple[Figure, np.ndarray]:
     """Return a figure with rows and columns of axes of the same size [inch], shape [row, column]."""
-    # Not by pyplot, which would keep the figure and may look for a screen.
+    # Not by pyplot, which keeps references to figures and may need a display.
     figure = Figure(figsize=(max(width * columns, 3.2), height * rows + 0.5))
     return figure, figure.subplots(rows, columns, squeeze=False)
 
@@ -109,11 +109,11 @@ def draw_band(
 
 
 def log_axis(axes: Axes, label: str, *, vertical: bool = False) -> None:
-    """Make an axis logarithmic, with numbers that have room; to be called after drawing."""
+    """Make an axis logarithmic, with readable tick labels; call after drawing."""
     axis = axes.yaxis if vertical else axes.xaxis
     axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}label": label})
     low, high = axis.get_view_interval()
-    # A decade or less would have one number, or all of them on top of each other.
+    # Within a decade, the default has one label or overlapping ones.
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(_tick))
     axis.set_minor_formatter(NullFormatter())
@@ -141,7 +141,7 @@ def legend(figure: Figure, columns: int | None = None) -> None:
 
 
 def legend_of_methods(figure: Figure, names: Sequence[str]) -> None:
-    """Put a legend of methods, as dots, above all axes, in as many rows as the width asks for."""
+    """Add a legend of methods, as dots, above all axes, in as many rows as needed."""
     looks = [method(name) for name in names]
     dots = [Line2D([], [], marker="o", linestyle="none", color=look.colour) for look in looks]
     if dots:
@@ -152,7 +152,7 @@ def legend_of_methods(figure: Figure, names: Sequence[str]) -> None:
 
 
 def fix_layout(figure: Figure) -> None:
-    """Place the axes once, not for each file: for fifty panels that takes longer than drawing them."""
+    """Lay out the axes once instead of per file, because for fifty panels it takes longer than drawing."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
@@ -166,7 +166,7 @@ def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -
         drawings: The figures.
         folder: Folder to write to.
         origin: Origin of the figures, see :func:`plab.report.writing.origin`; ``footer`` is a list of lines
-            for the files' own metadata.
+            for the metadata of the files.
     """
     folder.mkdir(parents=True, exist_ok=True)
     made = " | ".join(origin["footer"])
@@ -174,7 +174,7 @@ def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -
         for drawing in drawings:
             path = folder / drawing.name
             fix_layout(drawing.figure)
-            # Without the time of day the same runs give the same bytes.
+            # Without a time stamp, figures of the same runs are byte-identical.
             drawing.figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None, "Subject": made})
             drawing.figure.savefig(path.with_suffix(".png"), metadata={"Description": made})
             beside = {"notes": drawing.notes, "numbers": drawing.numbers, **origin}

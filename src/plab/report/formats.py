@@ -31,10 +31,10 @@ class Table:
         form: ``ours``, ``paper`` or ``comparison``: its folder.
         title: Heading.
         cells: Text of the table.
-        data: The same as numbers with all digits, a row per number or group of numbers: the CSV file.
+        data: CSV rows with all digits, one per number or group of numbers.
         bold: Mask of bold cells, of the shape of ``cells``; None if none is.
         notes: Notes on the contents and the provenance of the table.
-        long: True if it may be longer than a page.
+        long: Whether it may be longer than a page.
     """
 
     name: str
@@ -48,12 +48,12 @@ class Table:
 
     @property
     def file(self) -> Path:
-        """Its files, without the ending, below the folder of tables."""
+        """Path of its files below the folder of tables, without suffix."""
         return Path(self.form) / self.name
 
 
 def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
-    """Write a number with the sign of a minus, not that of a hyphen; a dash if there is none."""
+    """Format a number with a minus sign instead of a hyphen; a dash if it is missing."""
     if math.isnan(value):
         return NOTHING
     # Without a minus sign for values rounded to zero.
@@ -63,7 +63,7 @@ def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
 
 
 def aligned(cells: pd.DataFrame) -> list[str]:
-    """Return how each column of a table's texts is aligned: ``r`` where it has numbers, ``l`` elsewhere."""
+    """Return the alignment of each column: ``r`` for numbers, ``l`` otherwise."""
     columns = ([str(text) for text in cells.iloc[:, k]] for k in range(cells.shape[1]))
     known = ([text for text in texts if text not in ("", NOTHING)] for texts in columns)
     return ["r" if texts and all(map(_NUMBER.match, texts)) else "l" for texts in known]
@@ -74,7 +74,7 @@ _NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
 
 
 def mean_and_std(summary: Summary, decimals: int = 2) -> str:
-    """Write a mean and its standard deviation, which a single number does not have."""
+    """Format a mean with its standard deviation, omitted for a single number."""
     mean = number(summary.mean, decimals)
     return mean if summary.count < 2 else f"{mean} ± {number(summary.std, decimals)}"
 
@@ -123,7 +123,7 @@ INPUTS
 """
 
 _LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"}
-"""Signs that a plain document has no letter for."""
+"""Symbols that need LaTeX commands."""
 
 
 _COLUMN = {"remark": r"p{0.55\linewidth}"}
@@ -141,7 +141,7 @@ def _latex_text(text: str) -> str:
 def _latex(table: Table) -> str:
     """Return a table environment for ``\\input``, which needs booktabs, graphicx, longtable.
 
-    A table wider than the page is scaled down, or set in smaller type where it is long.
+    A table wider than the page is scaled down, or set in a smaller font if it is long.
     """
     cells = table.cells.map(_latex_text).rename(columns=_latex_text)
     style = cells.style.hide(axis="index")
@@ -161,7 +161,7 @@ def _latex(table: Table) -> str:
         position_float=None if table.long else "centering",
     )
     if table.long:
-        # The pages after the first need no caption.
+        # Later pages have no caption.
         text = re.sub(r"\\caption\[\].*\n", "", text)
         if _characters(table) > _WIDEST:
             size = r"\tiny\setlength{\tabcolsep}{3pt}"
@@ -173,7 +173,7 @@ def _latex(table: Table) -> str:
 
 
 _WIDEST = 115
-"""Characters of a row, three of them per gap, that fit on a page in footnote size."""
+"""Number of characters per row, with three per gap, that fit on a page in footnote size."""
 
 
 def _characters(table: Table) -> int:

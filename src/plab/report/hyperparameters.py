@@ -22,11 +22,11 @@ _GRADIENT_KEYS = {
     "gd": ("softness", "lr", "momentum", "iterations", "action_init"),
     "adam_h": ("lr", "betas", "eps", "iterations", "action_init"),
 }
-"""Settings by method that have an effect on it."""
+"""Effective settings by method."""
 
 
 def hyperparameters() -> list[Table]:
-    """Return the settings of all methods: ours, the paper's, and the two compared."""
+    """Return the settings of all methods: ours, the paper's, and a comparison."""
     data = pd.DataFrame([*_rl_rows(), *_gradient_rows()])
     shown = data.replace("", NOTHING).assign(method=data["method"].map(lambda name: method(name).label))
     ours = shown[["method", "key", "plab", "remark"]].rename(columns={"plab": "value"})
@@ -103,13 +103,13 @@ def _comments(text: str, profile: str | None) -> dict[str, str]:
 
 
 def _value(value: Any) -> str:
-    """Write a number without needless digits, whatever form YAML had it in."""
+    """Format a number without unnecessary digits."""
     if isinstance(value, list):
         return f"[{', '.join(_value(item) for item in value)}]"
     if value is None or isinstance(value, bool):
         return "none" if value is None else str(value).lower()
     try:
-        # YAML reads 1e-8 as text.
+        # YAML parses 1e-8 as text.
         number = float(value)
     except ValueError:
         return str(value)

@@ -1,4 +1,4 @@
-"""Pictures and films of the page of results: which runs they show, and where they are."""
+"""Pictures and films of the results page: selection of runs, and file names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FOLDER = "media"
 
 @dataclass(frozen=True)
 class Shown:
-    """A configuration and the runs of it that are shown, one per method.
+    """A configuration and its displayed runs, one per method.
 
     Attributes:
         task: Name of the task.
@@ -42,8 +42,8 @@ class Shown:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its pictures, which depends on the runs and films."""
-        # Repeated runs have the same configuration, but other actions.
+        """Name of the folder of its pictures, derived from the runs and films."""
+        # Repeated runs have the same configuration, but different actions.
         drawn = [self.runs[name] for name in sorted(self.drawn)]
         own = [[run["config_hash"], run["best_loss"]] for run in drawn]
         text = json.dumps([own, sorted(self.films)])
@@ -59,11 +59,11 @@ def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
 
     Args:
         runs: Our runs.
-        every_run: Give each of them a picture and a film, not only the best of each configuration a picture,
-            and the best of each task a film.
+        every_run: Whether all runs have a picture and a film; otherwise only the best of each configuration
+            has a picture, and the best of each task a film.
     """
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
-    # Ties are broken by the hash, whatever order the files were found in.
+    # Ties are broken by the hash, independent of the order of files.
     table = runs.table.sort_values(["score", "config_hash"], ascending=[False, True])
     for row in table.to_dict("records"):
         found[row["task"], row["variant"]].setdefault(row["method"], row)
@@ -96,7 +96,7 @@ def best_of_tasks(shown: Sequence[Shown]) -> dict[str, tuple[Shown, str]]:
 
 
 def present(shown: Shown, out: Path) -> dict[str, str]:
-    """Return the pictures that there are of a configuration.
+    """Return the existing pictures of a configuration.
 
     Args:
         shown: The configuration.
@@ -121,8 +121,7 @@ def missing_pictures(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, 
         out: Folder of the page.
 
     Returns:
-        Result files and whether each has a film, by the stems of the pictures' names, by folder; of folders
-        that do not exist.
+        For missing folders, result files by the stems of picture names, and whether each has a film.
     """
     folders = {out / FOLDER / one.folder: one for one in shown}
     return {

@@ -1,4 +1,4 @@
-"""Names, order, kinds and colours of the methods, the same in every table and figure."""
+"""Names, order, kinds and colours of methods in all tables and figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Method:
             that is not plab's.
         colour: Colour of its curves.
         dashes: Line style, for those who do not see the colour.
-        of: Method that these are some of the runs of, empty if they are all: see :func:`part`.
+        of: Method of which these are some of the runs, empty for all: see :func:`part`.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Method:
 
     @property
     def on_dark(self) -> str:
-        """Its colour on a dark ground, where black would not be seen."""
+        """Colour on a dark background."""
         return "#FFFFFF" if self.colour == "#000000" else self.colour
 
 
@@ -41,29 +41,29 @@ _STYLES = {
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
-# In the order of the paper, then those that it does not have.
+# In the order of the paper, followed by further methods.
 _KNOWN = tuple(_STYLES[name] for name in dict.fromkeys((*PAPER_METHODS, *_STYLES)))
 
 
 def method(name: str) -> Method:
-    """Return how a method appears; one that plab does not know is grey and belongs to no kind."""
+    """Return the appearance of a method; unknown methods are grey and have no kind."""
     return _STYLES.get(name) or Method(name, name, "", "#777777", ":")
 
 
 _PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Okabe and Ito's, the yellow that is not seen on white apart."""
+"""Okabe and Ito's palette, without yellow, which is hardly visible on white."""
 
 _DASHES = ("-", "--", "-.", ":")
 
 
 def part(name: str, key: str, value: str, place: int) -> str:
-    """Make a method of those runs of one that have a value of a setting, known to :func:`method` from now on.
+    """Register the runs of a method with a value of a setting as a separate method for :func:`method`.
 
     Args:
         name: Name of the method.
         key: Name of the setting.
         value: Its value.
-        place: Number of the method among all such ones, from 0: its colour and line style.
+        place: Index among these methods, which determines colour and line style.
 
     Returns:
         Name of the new one.
@@ -75,7 +75,7 @@ def part(name: str, key: str, value: str, place: int) -> str:
 
 
 def ordered(present: Iterable[str]) -> list[str]:
-    """Return the paper's methods, then the others that are present, in the order of tables and legends."""
+    """Return the paper's methods, then the others present, in the order of tables and legends."""
     others = set(present) - set(PAPER_METHODS)
     known = [known.name for known in _KNOWN if known.name in others]
     return [*PAPER_METHODS, *known, *sorted(others - set(known))]

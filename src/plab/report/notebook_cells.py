@@ -28,11 +28,11 @@ _COLOURS = {
 
 
 def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
-    """Find the runs, and say so in one line where there are none.
+    """Find the runs; show a message if there are none.
 
     Args:
-        results: Folders or archives; ``example`` is the archive that comes with plab.
-        words: Choice of runs, as for ``plab report``.
+        results: Folders or archives; ``example`` is the bundled archive.
+        words: Selection of runs, as for ``plab report``.
     """
     runs = collect([resolve(source) for source in results], select(words, NAMES))
     if runs.table.empty:
@@ -44,7 +44,7 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
 
 
 def show_origin(runs: Runs, command: str) -> None:
-    """Show which command and which result files everything below comes from."""
+    """Show the command and the result files behind the following output."""
     lines = [
         f"Made by <code>{escape(command)}</code> from {len(runs.table)} run(s); SHA-256 over them "
         f"<code>{runs.digest}</code>."
@@ -61,7 +61,7 @@ def say(text: str) -> None:
 
 
 def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
-    """Show a table of the report, or cells of text; verdicts are coloured."""
+    """Show a table of the report, or cells of text, with coloured verdicts."""
     whole = table if isinstance(table, Table) else Table("", "", "", table, table, notes=list(notes))
     sides = ["number" if side == "r" else "" for side in aligned(whole.cells)]
     names = zip(whole.cells.columns, sides, strict=True)
@@ -81,7 +81,7 @@ def _cell(text: str, bold: bool, side: str) -> str:
 
 
 def show_figure(drawing: Drawing | None) -> None:
-    """Show a figure with its notes; of None, that there is nothing to draw."""
+    """Show a figure with its notes, or a message for None."""
     if drawing is None:
         say("*Nothing to draw: there are no runs for it.*")
         return

@@ -1,4 +1,4 @@
-"""The report notebooks, executed without a browser and turned into pages."""
+"""Execution of the report notebooks, and conversion to HTML."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def require_notebooks() -> None:
 def execute(
     names: Sequence[str], parameters: Mapping[str, Any], out: Path, report: Callable[[int, str], None]
 ) -> list[Path]:
-    """Execute notebooks and write each as a page, and as a notebook with its outputs.
+    """Execute notebooks and write each as HTML, and as a notebook with outputs.
 
     Args:
         names: Names among :data:`NOTEBOOKS`.
@@ -80,7 +80,7 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
     at = next(k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
     given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
     notebook.cells.insert(at + 1, nbformat.v4.new_code_cell(f"# Given on the command line\n{given}"))
-    # It runs where the command was given, so that relative paths mean the same.
+    # Executed in the working directory, so that relative paths are valid.
     client = NotebookClient(
         notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": os.getcwd()}}
     )

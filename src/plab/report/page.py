@@ -1,9 +1,8 @@
 """Static page of results: overview; curves, pictures, films and runs of each configuration.
 
-The page needs no server and no network. ``index.html`` holds style, script and the overview. The curves of a
-configuration are in a script below ``data/``, loaded on demand, because pages opened as files can load
-scripts but not data. ``data/state.js`` names the current version, so that an open page notices that it has
-been written again.
+The page needs no server and no network. ``index.html`` contains style, script and the overview. The curves of
+a configuration are in a script below ``data/``, loaded on demand, because pages opened as files can load
+scripts but not data. ``data/state.js`` has the current version, so that an open page detects updates.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from plab.report.templates import asset, render
 from plab.results.run_file import replace_file
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
-"""Columns of the curves, and the value below which their values are clamped, as in the paper's figures."""
+"""Columns of the curves, and their lower bounds for clamping, as in the paper's figures."""
 
 _POINTS = 160
 """Maximum number of points of a curve."""
@@ -57,11 +56,11 @@ class Page:
     """Page of some runs: numbers are computed once, pictures are added when they are rendered.
 
     Attributes:
-        shown: Configurations and the runs of them that pictures show.
+        shown: Configurations and their runs in pictures.
     """
 
     def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_run: bool = False) -> None:
-        """Write curves and runs of each configuration to ``data/``, and compute the rest.
+        """Write curves and runs of each configuration to ``data/``, and compute the overview.
 
         Args:
             runs: Our runs.
@@ -112,7 +111,7 @@ class Page:
     def _write_details(self, runs: Runs) -> None:
         folder = self._out / "data"
         folder.mkdir(parents=True, exist_ok=True)
-        # Left by a process that was killed.
+        # Left by a killed process.
         for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
             path.unlink()
         series = load_series(runs)
@@ -124,10 +123,10 @@ class Page:
                 path.unlink()
 
     def write(self, *, drawing: bool = False) -> None:
-        """Write ``index.html`` with the pictures that there are.
+        """Write ``index.html`` with the existing pictures.
 
         Args:
-            drawing: True while pictures are being drawn. Then, or while runs are in progress, the page
+            drawing: Whether pictures are being rendered. Then, or while runs are in progress, the page
                 reloads itself after updates.
         """
         pictures = {one.name: present(one, self._out) for one in self.shown}
@@ -142,7 +141,7 @@ class Page:
 
 
 def _write(path: Path, text: str) -> None:
-    # Atomically, for a browser may read it at any time.
+    # Atomically, because a browser may read it at any time.
     replace_file(path, text.encode(), sync=False)
 
 
@@ -168,7 +167,7 @@ def _ends(found: Interval) -> list[float | None]:
 
 
 def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -> dict[str, Any]:
-    """Return our score of a task, or of one of its variants, the paper's and their difference, by method."""
+    """Return our score, the paper's, and their difference, by method, for a task or one of its variants."""
     return {
         name: {
             "ours": _summary(cell.ours) | {"expected": cell.expected},
@@ -202,7 +201,7 @@ def _sentence(runs: Runs) -> str:
 
 
 def _incomplete(runs: Runs) -> list[str]:
-    """Return a sentence on methods that lack runs, and how many they have; nothing where all are complete."""
+    """Return a note on methods with missing runs, with their numbers of runs; empty if complete."""
     expected = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
     counts = {method(name).label: int((runs.table["method"] == name).sum()) for name in runs.present}
     short = [f"{label} with {count}" for label, count in counts.items() if count < expected]
@@ -277,7 +276,7 @@ def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _command(config: Mapping[str, Any]) -> str:
-    """Return the command that makes a run again."""
+    """Return the command that repeats a run."""
     drawn = config.get("seed_scene")
     variant = config["variant"] if drawn is None else f"random seed_scene={drawn}"
     words = [f"task={config['task']['name']}", *f"variant={variant}".split()]
@@ -291,14 +290,14 @@ def _command(config: Mapping[str, Any]) -> str:
 
 
 def _override_text(value: Any) -> str:
-    """Write a value as an override has it."""
+    """Format a value as in an override."""
     if isinstance(value, str):
         return value
     return json.dumps(value, separators=(",", ":")).replace("Infinity", ".inf")
 
 
 def _curve(drawn: Band | None) -> list[list[float]] | None:
-    """Return abscissae, means and standard deviations, thinned out evenly for a logarithmic axis."""
+    """Return abscissae, means and standard deviations, subsampled evenly on a logarithmic axis."""
     if drawn is None:
         return None
     count = len(drawn.x)

@@ -15,7 +15,7 @@ from plab.config.suite import PAPER_SEEDS
 from plab.results import ResultsError
 
 PAPER_SEED_COUNT = len(PAPER_SEEDS)
-"""Runs of each configuration in the paper."""
+"""Number of runs of each configuration in the paper."""
 
 
 @functools.cache
@@ -40,8 +40,8 @@ class Benchmark:
     """A benchmark with a CSV file.
 
     Attributes:
-        file: Name that its file has in a folder of benchmarks.
-        command: Command that writes it, with ``{file}`` and ``{folder}`` for where.
+        file: File name in a folder of benchmarks.
+        command: Command that generates it, with placeholders ``{file}`` and ``{folder}``.
         columns: Columns that are needed.
     """
 
@@ -94,5 +94,5 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
 
 
 def origin(table: pd.DataFrame | None) -> list[str]:
-    """Return sentences on the file that a table was read from; none where it was not."""
+    """Return notes on the file of a table, if it was read from one."""
     return [] if table is None else [f"{line}." for line in table.attrs.get("origin", [])]

@@ -17,7 +17,7 @@ from plab.results import BUDGETS as SIMULATED
 from plab.results import read, read_curves
 
 AXES = ("episodes", "seconds", "substeps")
-"""Axes of curves: episodes, wall time [s], simulated substeps."""
+"""Abscissae of curves: episodes, wall time [s], simulated substeps."""
 
 BUDGETS = (1e3, 1e4, 1e5, 1e6)
 """Budgets at which methods are compared [environment steps]."""
@@ -68,13 +68,13 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
 
 
 def load_rows(path: str | Path) -> Rows:
-    """Return the iterations of one run as :func:`load_series` does."""
+    """Return the iterations of one run, as :func:`load_series`."""
     run = read(path)
     return rows_on_axes(run.config, run.columns)
 
 
 def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
-    """Return the iterations of a run that has been read as :func:`load_series` does."""
+    """Return the iterations of a loaded run, as :func:`load_series`."""
     rows = {name: np.asarray(values) for name, values in iterations.items()}
     sim, known = config["sim"], known_family(config["method"]["family"])
     simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
@@ -95,18 +95,17 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
 
 
 def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
-    """Return mean and spread of a column over runs, from where all have begun to where the first one ends; a
-    run that is solved keeps its score.
+    """Return mean and standard deviation of a column over runs, on the common range; a solved run keeps its
+    score.
 
     Args:
         tables: Iterations of each run.
         axis: One of :data:`AXES`.
         column: Column of the values.
-        floor: Lower values of a run count as this, as in the paper's figures; None keeps them.
+        floor: Lower bound of the values of each run, as in the paper's figures; None keeps them.
 
     Returns:
-        The band on the union of the runs' points, between which their values are interpolated; None without
-        runs.
+        The band at the union of the runs' points, with linear interpolation; None without runs.
     """
     pairs = ((np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables)
     curves = [(x, y) for x, y in pairs if len(x)]

@@ -1,8 +1,8 @@
 """Statistics of scores: means, confidence intervals, and aggregates over a suite by stratified bootstrap.
 
 Interquartile mean, performance profile and probability of improvement as in Agarwal et al., Deep
-Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021). Strata are configurations:
-a bootstrap sample draws as many runs of each as there are.
+Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021). Strata are configurations;
+bootstrap samples have the same number of runs per configuration.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Summary:
 
     Attributes:
         mean: Their mean; NaN of none.
-        std: Their standard deviation as a population, as in the paper's tables; NaN of none.
+        std: Population standard deviation, as in the paper's tables; NaN of none.
         count: Their number.
     """
 
@@ -38,7 +38,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its confidence interval; the ends are NaN where there are too few numbers for one."""
+    """A number with its confidence interval, NaN for too few numbers."""
 
     value: float
     low: float
@@ -54,18 +54,18 @@ def summarise(values: Sequence[float] | np.ndarray) -> Summary:
 
 
 def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) -> Interval:
-    """Compare two sets of runs, stratum by stratum, where strata (variants) are the same in both.
+    """Compare two sets of runs with the same strata (variants).
 
-    The difference is the mean over the strata of the differences of their means. Its interval is Welch's: the
-    variance of a stratum's mean is estimated within the stratum, on both sides, degrees of freedom are
-    Welch's and Satterthwaite's. The rounding of the paper's values to two decimals is neglected.
+    The difference is the mean over the strata of the differences of means. The interval is Welch's, with
+    variances estimated within strata and Welch-Satterthwaite degrees of freedom. The rounding of the paper's
+    values to two decimals is neglected.
 
     Args:
         ours: Mean, population standard deviation and count of each stratum.
         theirs: The same, in the same order.
 
     Returns:
-        Ours minus theirs, over the strata that both have; without ends where a stratum has a single run.
+        Ours minus theirs, over common strata; without interval if a stratum has a single run.
     """
     pairs = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.count and b.count]
     if not pairs:
@@ -84,13 +84,13 @@ def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
     """Return a mean over ``count`` strata with its interval, from the contributions ``sides``."""
     if any(side.count < 2 for side in sides):
         return Interval(value, float("nan"), float("nan"))
-    # The variance of a mean, from a population's standard deviation.
+    # Variance of a mean, from the population standard deviation.
     shares = np.array([side.std**2 / (side.count - 1) for side in sides]) / count**2
     freedom = np.array([side.count - 1 for side in sides])
     if not shares.any():
         return Interval(value, value, value)
     degrees = shares.sum() ** 2 / (shares**2 / freedom).sum()
-    # SciPy's statistics would take half of the time of all tables to import.
+    # Importing SciPy's statistics would take half of the time of all tables.
     reach = float(special.stdtrit(degrees, 0.5 + CONFIDENCE / 2) * np.sqrt(shares.sum()))
     return Interval(value, value - reach, value + reach)
 
@@ -107,7 +107,7 @@ Strata = Sequence[np.ndarray]
 
 
 def interquartile_mean(strata: Strata) -> Interval:
-    """Return the mean of the middle half of all scores, with its percentile interval."""
+    """Return the interquartile mean of all scores, with its percentile interval."""
 
     def middle(samples: np.ndarray) -> np.ndarray:
         # As SciPy's trim_mean, which takes longer to import than all tables take to compute.
@@ -126,7 +126,7 @@ def performance_profile(strata: Strata, thresholds: np.ndarray) -> tuple[np.ndar
         thresholds: Thresholds, shape [threshold].
 
     Returns:
-        Shares and the ends of their pointwise percentile intervals, each of shape [threshold].
+        Fractions and their pointwise percentile intervals, each of shape [threshold].
     """
     samples = _resampled(strata)
     shares = np.stack([(samples > threshold).mean(axis=1) for threshold in thresholds])
@@ -136,11 +136,11 @@ def performance_profile(strata: Strata, thresholds: np.ndarray) -> tuple[np.ndar
 
 
 def improvement(ours: Strata, theirs: Strata) -> Interval:
-    """Return the probability that a run of one method beats one of another, ties counting half.
+    """Return the probability that a run of one method scores higher than one of another; ties count half.
 
     Args:
-        ours: Scores of the one, by configuration.
-        theirs: Scores of the other, the same configurations in the same order.
+        ours: Scores of the first method, by configuration.
+        theirs: Scores of the second method, for the same configurations.
 
     Returns:
         Mean over the configurations, with its percentile interval.
@@ -178,7 +178,7 @@ def _interval(value: float, samples: np.ndarray) -> Interval:
 
 @dataclass(frozen=True)
 class Shared:
-    """The scores that methods are compared by, all together.
+    """Scores for the joint comparison of methods.
 
     Attributes:
         keys: Task and variant of the configurations for which all methods shown have runs.
@@ -192,7 +192,7 @@ class Shared:
 
 
 def shared_strata(runs: Runs) -> Shared:
-    """Return the scores of the runs, of methods and configurations as :func:`common_strata` chooses them."""
+    """Return the scores of the runs, for the methods and configurations of :func:`common_strata`."""
     scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
     for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
         scores[name][task, variant] = own["score"].to_numpy(float)
@@ -219,9 +219,9 @@ def common_strata(
 ) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
     """Return configurations with runs of several methods, and the scores of these methods.
 
-    Methods are left out one by one, each time the one without which most configurations are shared, of
-    several the one with the fewest. The methods and configurations with the largest number of pairs are
-    selected: at least two methods, if any two share a configuration.
+    Methods are removed one by one: each time the one whose removal leaves the most common configurations,
+    with ties broken by fewest configurations. The methods and configurations with the largest number of pairs
+    are selected: at least two methods, if any two share a configuration.
 
     Args:
         scores: By method and configuration, shape [run] each.

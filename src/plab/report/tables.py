@@ -36,13 +36,13 @@ INTERVAL = f"{CONFIDENCE:.0%} interval"
 
 @dataclass(frozen=True)
 class Cell:
-    """Scores of a method in a task, or in one of its variants.
+    """Scores of a method for a task, or one of its variants.
 
     Attributes:
-        ours: Mean, spread and number of our runs.
-        expected: Number of runs that there should be.
-        paper: The same of the paper; that of the whole method for some of its runs.
-        difference: Ours minus the paper's; of a task the mean over the variants that both have.
+        ours: Mean, standard deviation and number of our runs.
+        expected: Expected number of runs.
+        paper: The paper's values; for a part of a method those of the whole method.
+        difference: Ours minus the paper's; for a task the mean over common variants.
     """
 
     ours: Summary
@@ -92,7 +92,7 @@ def ordered_tasks(tasks: Sequence[str]) -> list[str]:
 
 
 def settings_note(runs: Runs) -> list[str]:
-    """Return sentences on protocol and settings where these are not plab's own."""
+    """Return notes on protocol and settings that differ from plab's."""
     protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
     if not runs.unusual:
         return protocol
@@ -106,7 +106,7 @@ def settings_note(runs: Runs) -> list[str]:
 
 
 def ends(interval: Interval, decimals: int = 2) -> str:
-    """Write the ends of an interval, a dash if there are none."""
+    """Format an interval, a dash if there is none."""
     if np.isnan(interval.low):
         return NOTHING
     return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
@@ -116,17 +116,17 @@ def ends(interval: Interval, decimals: int = 2) -> str:
 
 
 def iou_per_task(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per task and method: ours, the paper's, and the two compared."""
+    """Return normalised incremental IoU per task and method: ours, the paper's, and a comparison."""
     return _iou_tables(runs, "task", "over variants and seeds")
 
 
 def iou_per_configuration(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
+    """Return normalised incremental IoU per configuration and method: ours, the paper's, and a comparison."""
     return _iou_tables(runs, "configuration", "over seeds")
 
 
 def distances(runs: Runs) -> list[Table]:
-    """Return the distances of final shapes from their targets, per task and method; nothing where no run has
+    """Return the distances of final shapes from their targets, per task and method; empty if no run has
     them."""
     measured = [name for name in DISTANCES if name in runs.table]
     shown, data = [], []
@@ -198,7 +198,7 @@ def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
 
 
 def _text(summary: Summary, expected: int) -> str:
-    """Write mean and spread, and how many runs there are where some are missing."""
+    """Format mean and standard deviation, and the number of runs if some are missing."""
     count = f"{summary.count}/{expected}"
     if not summary.count:
         return count if expected else NOTHING
@@ -212,7 +212,7 @@ def _numbers(summary: Summary, expected: int) -> dict[str, float]:
 
 
 def _best(line: Sequence[tuple[Summary, int]], methods: Sequence[str]) -> list[bool]:
-    """Return which cells are the best of their kind of method, as printed; none where one is incomplete."""
+    """Return the mask of the best cells per kind of method, as printed; none if a cell is incomplete."""
     best = [False] * len(line)
     for kind in (RL, GRADIENT):
         rivals = [
@@ -236,7 +236,7 @@ AGREES = f"within two of the paper's standard deviations or {TOLERANCE:g} of its
 
 
 def compared_cells(runs: Runs) -> pd.DataFrame:
-    """Return the cells that both have, a row per task, variant and method.
+    """Return the common cells, a row per task, variant and method.
 
     Returns:
         Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
@@ -255,8 +255,7 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
 
 
 def agreement(runs: Runs) -> list[Table]:
-    """Return the agreement per method, per kind of method if there are both, and over all of them; nothing
-    where no cell is in both."""
+    """Return the agreement per method, per kind of method and overall; empty without common cells."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
@@ -287,8 +286,8 @@ def in_all(cells: pd.DataFrame) -> dict[str, float]:
     """Return the agreement of some of the :func:`compared_cells` as a whole.
 
     Returns:
-        Their number ``cells``, ``correlation`` (NaN where nothing varies), mean ``distance``, mean
-        ``difference``, and the share that ``agree``.
+        Number of ``cells``, ``correlation`` (NaN without variation), mean ``distance``, mean ``difference``,
+        and the fraction ``agree``.
     """
     varied = len(cells) > 1 and cells["ours"].std() > 0.0 and cells["paper"].std() > 0.0
     return {
@@ -319,7 +318,7 @@ def solvability(runs: Runs) -> list[Table]:
             mean, std = float(best.loc[key, "iou_mean"]), float(best.loc[key, "iou_std"])
             theirs = Summary(mean, std, PAPER_SEED_COUNT)
             printed = f"{mean_and_std(theirs)} ({method(name).label})"
-        # A replay has no spread: all of the interval is the paper's.
+        # A replay is deterministic, so the interval is the paper's.
         gap = stratified_difference([Summary(score, 0.0, 0 if np.isnan(score) else 2)], [theirs])
         which = {"task": key[0], "variant": key[1]}
         rows.append(
@@ -413,7 +412,7 @@ _TIMES = (
 
 
 def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Return times per environment step and task: ours, the paper's, and the two compared.
+    """Return times per environment step and task: ours, the paper's, and a comparison.
 
     Args:
         runs: Our runs.
@@ -428,7 +427,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
             shown = {"task": task, "device": device}
             for kind, title in (("gradient", "gradient methods [ms]"), ("training", "RL [ms]")):
                 chosen = own[(own["device"] == device) & (own["kind"] == kind)]
-                # Runs of one batch have equal shares of the same time: one measurement.
+                # Runs of one batch share their time and count as one measurement.
                 mine = summarise(np.unique(chosen["ms"].to_numpy(float).round(9)))
                 shown[title] = _measured(mine)
                 numbers = {"ms": mine.mean, "std": mine.std, "measurements": mine.count}
@@ -481,7 +480,7 @@ def _compared_times(times: Sequence[tuple[str, str, str, Summary, float]], more:
     """Return the table of task, measured calls, place of the measurement, our times and the paper's."""
     data, cells = [], []
     for task, kind, where, mine, theirs in times:
-        # The paper gives no spread: all of the interval is ours.
+        # The paper gives no standard deviation, so the interval is ours.
         gap, ratio = stratified_difference([mine], [Summary(theirs, 0.0, 2)]), theirs / mine.mean
         which = {"task": task, "measured": where, "what": kind, "measurements": mine.count}
         which |= {"ms": mine.mean, "std": mine.std, "paper_ms": theirs}

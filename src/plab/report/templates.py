@@ -1,4 +1,4 @@
-"""The pages' templates: one head and one bar for all of them, in ``web/base.html``."""
+"""Page templates, with a common head and navigation bar in ``web/base.html``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def render(template: str, package: str = _OWN, **values: Any) -> str:
     """Return a page.
 
     Args:
-        template: Its template, which extends ``base.html``.
+        template: Template that extends ``base.html``.
         package: Package with the template in its folder ``web``.
         **values: Variables of the template.
     """

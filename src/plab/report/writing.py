@@ -1,4 +1,4 @@
-"""Files of all tables and all figures, with their origin."""
+"""Files of tables and figures, with provenance."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
 def write_curves(
     runs: Runs, ablation: Ablation | None, out: Path, command: str, errors: pd.DataFrame | None = None
 ) -> list[Drawing]:
-    """Draw all figures that there are runs for.
+    """Draw all figures with data.
 
     Args:
         runs: Our runs.
@@ -118,7 +118,7 @@ def origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
 
 
 def _write_runs(runs: Runs, out: Path) -> None:
-    """Write the list of the runs' files, once for all tables or figures."""
+    """Write the list of result files, once for all tables or figures."""
     known = runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else []
     out.mkdir(parents=True, exist_ok=True)
     (out / "runs.json").write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")

@@ -1,9 +1,9 @@
 """Result files: one HDF5 file per run, replaced atomically while it runs, loaded into pandas afterwards.
 
-The layout is described in docs/developers/format.md. A run that is under way keeps its state in
-``<name>.partial.h5``, rewritten as a whole now and then: a process killed at any moment leaves the previous,
-readable version behind, from which the same command resumes. Finished runs can be packed into archives, which
-load like folders. This package imports neither torch nor taichi, so that reading results is quick.
+The layout is described in docs/developers/format.md. A run in progress stores its state in
+``<name>.partial.h5``, which is replaced atomically at intervals: after a kill, the previous version remains,
+from which the same command resumes. Finished runs can be packed into archives, which load like folders. This
+package does not import torch or Taichi, so that reading results is fast.
 """
 
 from importlib import import_module
@@ -64,7 +64,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import functions for many results on demand: a run does without them, and without pandas."""
+    """Import functions for many results on demand, because runs do not need them or pandas."""
     if name in _LAZY:
         return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

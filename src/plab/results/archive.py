@@ -31,8 +31,8 @@ class ArchiveSummary:
     Attributes:
         runs: Number of runs in the archive.
         archive_bytes: Size of the archive.
-        file_bytes: Size of the runs' own files; of those that came out of an archive, 0.
-        unreadable: Errors of files that could not be read, hence are not in the archive.
+        file_bytes: Total size of the runs' files; runs from archives count 0.
+        unreadable: Errors of unreadable files, which are not in the archive.
     """
 
     runs: int
@@ -58,11 +58,11 @@ def pack(
     Args:
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
-        wanted: Predicate of the runs to take; all finished ones by default.
-        keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
-        keep_resume: Keep the state from which unfinished runs go on.
-        digits: Significant decimal digits that the iterations keep at least, >= 1; None: all. Four take two
-            thirds off. Actions and the final evaluation always keep all.
+        wanted: Predicate of the runs to include; default: all finished ones.
+        keep_masses: Include mass tensors, which can be recomputed from the best actions.
+        keep_resume: Include the state for resuming unfinished runs.
+        digits: Least number of significant digits of the iterations, >= 1; None: all. four reduce the size by
+            two thirds. Actions and the final evaluation keep all digits.
 
     Raises:
         ResultsError: If there is nothing to pack, none of the files or archives in ``source`` can be read,
@@ -89,7 +89,7 @@ def pack(
         run = read(row.path)
         run = replace(
             run if digits is None else _rounded(run, digits),
-            # A path of the computer that made it means nothing elsewhere.
+            # Paths are meaningless on other computers.
             config=run.config | {"results_dir": "results"},
             masses=run.masses if keep_masses else {},
             resume=run.resume if keep_resume else None,
@@ -102,11 +102,11 @@ def pack(
 
 
 def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
-    """Return a zip file of some members; the same ones give the same bytes."""
+    """Return a zip file of some members, byte-identical for equal members."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, data in members:
-            # The earliest time that zip knows.
+            # The earliest time that zip supports.
             info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
             info.external_attr = 0o644 << 16
             archive.writestr(info, data, method, 9)
@@ -133,10 +133,10 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
 
     Args:
         archive: The archive.
-        folder: Results folder to put them into.
+        folder: Destination folder.
 
     Returns:
-        Number of files written, and of files left as they were.
+        Number of files written, and of existing files.
 
     Raises:
         ResultsError: If the archive cannot be read or a file cannot be written.
@@ -157,7 +157,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
 
 
 def _member(row: Row) -> Path:
-    """Return a run's place in an archive, or in a folder that it is unpacked to."""
+    """Return a run's path in an archive, or in a folder of results."""
     name = member_name(row.config, row.values["config_hash"])
     return name if _finished(row) else name.with_suffix(PARTIAL_SUFFIX)
 

@@ -47,7 +47,7 @@ def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
         source: Folder of results, archive or result file.
 
     Yields:
-        Each file, or place in an archive, with its fault, or None. Unreadable members are reported with the
+        Each file, or member of an archive, with its fault, or None. Unreadable members are reported with the
         archive's path.
 
     Raises:
@@ -67,7 +67,7 @@ def _checked(file: h5py.File, place: Path) -> tuple[Path, Fault | None]:
 
 
 def faults(run: RunResult) -> list[str]:
-    """Return the faults of a run that could be read."""
+    """Return the faults of a readable run."""
     found = [*_status(run), *_iterations(run), *_best(run)]
     if run.status == "finished":
         found += [*_evaluation(run), *_complete(run)]
@@ -91,7 +91,7 @@ def _iterations(run: RunResult) -> Iterator[str]:
         return
     family, common = known_family(run.config["method"]["family"]), (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
-    # Further columns of a family outside plab may hold anything.
+    # Additional columns of external families are not checked.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
     # Files of earlier versions may lack optional entries.
     if missing := [name for name in wanted if name not in table and name not in may_be_nan]:

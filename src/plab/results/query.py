@@ -25,7 +25,7 @@ def connect(
 
     Args:
         source: A folder, an archive, a single result file, or several of them.
-        iterations: Add the table ``iterations``, for which every file is opened.
+        iterations: Add the table ``iterations``, which requires opening every file.
 
     Returns:
         A connection; ``connection.sql("select ...").df()`` is a pandas table.
@@ -47,19 +47,19 @@ def query(
         Names of the columns, the rows, and the errors of unreadable files.
 
     Raises:
-        ArgumentError: If it is no query, or wrong.
+        ArgumentError: If the query is invalid.
         ResultsError: As for :func:`connect`.
     """
     import duckdb
 
     try:
-        # Opening every file takes long: only for a query that names the table.
+        # Opening every file is slow, so it is done only for queries of this table.
         connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
         with connection:
             answer = connection.execute(sql)
             return [column[0] for column in answer.description], answer.fetchall(), unreadable
     except duckdb.Error as error:
-        # Without hints and the drawing of the place in the query.
+        # Without hints and the marked position in the query.
         first = " ".join(str(error).partition("\n")[0].split())
         raise ArgumentError(f"{first}; there are the tables {', '.join(_TABLES)}") from None
 
@@ -77,16 +77,16 @@ def scores(
     Args:
         source: Folder of results, archive, file or several of them.
         chosen: Choice of runs.
-        keys: Further columns: those of :func:`plab.results.load`, or dotted keys of the configuration.
-        sort: Columns to sort by; default: the identity of a run. Runs that have no value there come last.
-        descending: Whether the largest comes first.
+        keys: Additional columns: those of :func:`plab.results.load`, or dotted keys of the configuration.
+        sort: Columns to sort by; default: the identity of a run. runs without a value come last.
+        descending: Sort in descending order.
 
     Returns:
         Columns task, variant, method, seed, protocol, targets (the files that they were taken from, None for
         plab's own), status, score and ``keys``; ``score`` as in :func:`plab.results.load`.
 
     Raises:
-        ArgumentError: If no run has one of ``keys``, or there is no column of ``sort``.
+        ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = readable_rows(source)
@@ -110,7 +110,7 @@ def scores(
 _NAMES = ("task", "variant", "method", "seed")
 
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
-"""Columns to keys of the configuration: runs that differ in them are not to be pooled."""
+"""Columns by configuration key that must agree within a mean."""
 
 _TABLES = {
     "runs": ["run", *COLUMNS, "score_best", "protocol", "targets", "folder"],
@@ -126,7 +126,7 @@ _NUMBERS = ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best
 """Columns of ``runs`` with fixed types."""
 
 _NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
-"""Columns of a table of runs that are no scalars of the final evaluation."""
+"""Columns of a table of runs other than scalars of the final evaluation."""
 
 
 def _connected(
@@ -149,7 +149,7 @@ def _connected(
 
 
 def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
-    """Return all tables but that of iterations."""
+    """Return all tables except ``iterations``."""
     rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
     for run, row in enumerate(found):
         values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
@@ -181,12 +181,12 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def _value(row: Row, name: str) -> Any:
-    """Return a column or a setting of a run, None where there is none."""
+    """Return a column or a setting of a run, or None."""
     value = row.values[name] if name in row.values else lookup(row.config, _SETTINGS.get(name, name))
     return None if value != value or isinstance(value, dict) else value
 
 
 def _comparable(column: pd.Series) -> pd.Series:
-    """Return the sort key of a column: numbers by value, also where they are text; all else as text."""
+    """Return the sort key of a column: numbers and numeric text by value, others as text."""
     numbers = pd.to_numeric(column, errors="coerce")
     return numbers if (numbers.notna() | column.isna()).all() else column.map(str, na_action="ignore")

@@ -1,4 +1,4 @@
-"""File of one run: HDF5 written atomically, read alone or from an archive."""
+"""File of one run: HDF5 written atomically, and read from a file or an archive."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016; groups and small data sets take a third of the space of the oldest format."""
 
 _RATIO, _SMALL = 1_100, 1 << 16
-"""Maximum number of bytes that a stored byte of a dataset may stand for (deflate reaches 1,032), and the size
-below which it may be anything."""
+"""Maximum compression ratio of a dataset (deflate reaches 1,032), and the size below which any ratio is
+accepted."""
 
 _images = itertools.count()
 
@@ -52,12 +52,12 @@ _images = itertools.count()
 
 
 def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
-    """Write a result file in one atomic step: readers see the previous file or the new one, never a part.
+    """Write a result file atomically: readers see the previous or the new file.
 
     Args:
         result: Result to write.
         path: File to create or replace.
-        compress: Compress the arrays (gzip) and wait until the disk has the data: for the final file.
+        compress: Compress the arrays (gzip) and flush to disk, for the final file.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
@@ -68,7 +68,7 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
 def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = False) -> None:
     """Create or replace a file in one atomic step.
 
-    With ``sync`` wait until the disk has it, with ``folders`` make those that it is in.
+    With ``sync`` flush it to disk, with ``folders`` create its parent folders.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
@@ -91,7 +91,7 @@ def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = Fals
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
-    """Return the bytes of the HDF5 file, built in memory: then a full disk is a plain OSError, not HDF5's.
+    """Return the bytes of the HDF5 file, built in memory, so that a full disk raises a plain OSError.
 
     Targets from user files are left out, because their licence is unknown.
     """
@@ -144,7 +144,7 @@ def read(path: str | Path) -> RunResult:
             of :func:`plab.results.load`.
 
     Raises:
-        ResultsError: If the file is missing, truncated, of another schema version or no result file at all.
+        ResultsError: If the file is missing, truncated, of another schema version or not a result file.
     """
     path = Path(path)
     with opened(path) as file:
@@ -166,8 +166,8 @@ def run_of(file: h5py.File, path: Path) -> RunResult:
 
 
 def read_progress(path: Path) -> dict[str, float]:
-    """Return ``rows``, ``episodes`` and ``score`` of a run under way, newer than its partial file ``path``;
-    empty where there is nothing newer."""
+    """Return ``rows``, ``episodes`` and ``score`` of a run in progress if newer than its partial file
+    ``path``, otherwise empty."""
     stem = path.name.removesuffix(PARTIAL_SUFFIX)
     with suppress(OSError, ValueError):
         return dict(json.loads(path.with_name(stem + PROGRESS_SUFFIX).read_text()))
@@ -206,7 +206,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive, turning whatever is wrong with it into a ResultsError; see :mod:`plab.files`."""
+    """Open an archive, converting all errors to ResultsError; see :mod:`plab.files`."""
     with explained(path), opened_zip(path, packed=True) as members:
         yield members
 
@@ -222,7 +222,7 @@ def opened_member(archive: zipfile.ZipFile, member: str, path: Path) -> Iterator
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn errors of reading inside the ``with`` block into a ResultsError that names ``path``."""
+    """Convert read errors inside the ``with`` block to a ResultsError that names ``path``."""
     try:
         yield
     except ResultsError:
@@ -269,8 +269,8 @@ def summary_of(file: h5py.File) -> dict[str, Any]:
 
 
 def columns_of(file: h5py.File) -> dict[str, np.ndarray]:
-    """Return the columns of the iterations of an open run, shape [iteration] each; ValueError if one holds no
-    numbers or is of another length than the others."""
+    """Return the columns of the iterations of an open run, shape [iteration] each; ValueError if one is not
+    numeric or has a different length."""
     found = {name: _numbers(file, f"iterations/{name}") for name in summary_of(file)["columns"]}
     if len({values.shape for values in found.values()}) > 1 or any(v.ndim != 1 for v in found.values()):
         raise ValueError("the columns of iterations differ in length")
@@ -291,7 +291,7 @@ def actions_of(file: h5py.File) -> np.ndarray | None:
 
 
 def _member(file: h5py.Group, path: str) -> Any:
-    """Return the low-level group or dataset of a path in this very file: no link leads to another file."""
+    """Return the low-level group or dataset at a path in this file, without following links."""
     place: Any = file.id
     for part in path.encode().split(b"/"):
         # KeyError if there is none.

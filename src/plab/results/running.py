@@ -1,9 +1,9 @@
-"""Run under way: its file, checkpoints, resumption, lock and provenance.
+"""A run in progress: file, checkpoints, resumption, lock and provenance.
 
 A lock is the operating system's (``flock``, on Windows ``msvcrt``) on ``<run>.lock`` beside the run's files.
-It ends with its process, so a lock file that is left behind is not locked. On a network file system it holds
-among all machines where the file system has locks, as NFS, Lustre (mounted with ``flock``) and GPFS do; where
-it has none, no run is computed.
+It is released when its process ends, so leftover lock files are not locked. On network file systems with
+locks, such as NFS, Lustre (mounted with ``flock``) and GPFS, it is valid on all machines; without locks, no
+run is computed.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ _log = logging.getLogger(__name__)
 
 
 class RunFile:
-    """Result file of one run while it runs: resumes an earlier process's state, records, finishes.
+    """Result file of a run in progress: resumes an earlier state, records rows, and finishes.
 
-    Unless the run is complete already, it holds the run's lock until it is closed, finished or released.
+    Unless the run is complete, it holds the run's lock until it is closed, finished or released.
 
     Attributes:
         path: Final file.
-        partial_path: File that carries the state of the run while it is under way.
+        partial_path: File with the state of the run in progress.
     """
 
     def __init__(self, cfg: Any) -> None:
@@ -65,14 +65,14 @@ class RunFile:
 
         Raises:
             RunBusyError: If another process computes the run.
-            NewerSchemaError: If a later plab has written a file of the run.
-            ResultsError: If the folder cannot be written or has no room, before anything is computed.
+            NewerSchemaError: If a file of the run was written by a newer plab.
+            ResultsError: If the folder is not writable or the disk is full, before anything is computed.
         """
         config = config_dict(cfg)
         digest = config_hash(config)
         self.path = Path(config["results_dir"]) / member_name(config, digest)
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
-        # Result and rows that are not yet in its columns. One object: an interrupt may arrive between any two
+        # Result, and rows not yet in its columns. A single object, because an interrupt may arrive between
         # assignments.
         known = RunResult(config, digest, provenance=provenance(config))
         self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
@@ -100,11 +100,11 @@ class RunFile:
             raise
 
     def _lock_and_resume(self, force: bool) -> None:
-        # Files are looked at under the lock: its last holder may have changed everything.
+        # Files are read under the lock, because its last holder may have changed them.
         self._lock = acquire(self.path)
         if self._lock is None:
             raise RunBusyError(f"{self.path} is being computed by another process")
-        # With force the replay buffer of a partial file is about to be replaced.
+        # With force the replay buffer of a partial file will be replaced.
         self._remove(*([PARTIAL_SUFFIX] if force else []))
         if not force:
             self._take_up_earlier()
@@ -114,11 +114,11 @@ class RunFile:
         self._found = set(self._files())
         self._known = self._state[0].rows
         if not self.partial_path.exists():
-            # A run under way has a file from its start: for plab status, and as the folder may have no room.
+            # A run in progress has a file from the start, for plab status and to detect a full disk.
             write(self.result, self.partial_path)
 
     def _remove_leftovers(self) -> None:
-        """Remove files left by a process that was killed just after it had finished the run."""
+        """Remove files left by a process that was killed just after finishing the run."""
         # Errors of removal are ignored. If the lock is held, the run is being recomputed.
         with suppress(OSError):
             if (lock := acquire(self.path)) is not None:
@@ -159,7 +159,7 @@ class RunFile:
 
     @property
     def result(self) -> RunResult:
-        """Result so far; from an earlier process where there was one."""
+        """Result so far, including earlier processes."""
         known, rows = self._state
         if rows:
             self._state = dataclasses.replace(known, columns=_extended(known.columns, rows)), ()
@@ -176,7 +176,8 @@ class RunFile:
         return self.result.rows > self._known
 
     def release(self) -> None:
-        """Let go of the run's lock, so that another process may resume it; nothing may be written after."""
+        """Release the run's lock, so that another process may resume it; nothing may be written
+        afterwards."""
         if self._lock is not None:
             with suppress(OSError):
                 self._progress.unlink(missing_ok=True)
@@ -190,12 +191,11 @@ class RunFile:
     def record(
         self, row: Mapping[str, float], resume: Mapping[str, Any], *, keep: bool = False, **changes: Any
     ) -> None:
-        """Append a row to the iterations, and rewrite the partial file if ``checkpoint_seconds`` are over.
+        """Append a row to the iterations, and rewrite the partial file after ``checkpoint_seconds``.
 
         Args:
-            row: Column name to number; the same columns in every call.
-            resume: State from which the next iteration starts: nested dictionaries of arrays, numbers and
-                strings.
+            row: Values by column; the same columns in every call.
+            resume: State for the next iteration: nested dictionaries of arrays, numbers and strings.
             keep: Write the partial file in any case.
             changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
         """
@@ -215,7 +215,7 @@ class RunFile:
         if row.get("kept_score", math.nan) >= 0.0:
             score = row["kept_score"]
         content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
-        # A full disk ends a run at its next checkpoint, not here.
+        # A full disk fails the run at its next checkpoint, not here.
         with suppress(ResultsError):
             replace_file(self._progress, json.dumps(content, default=float).encode(), sync=False)
 
@@ -232,8 +232,8 @@ class RunFile:
         self._written = time.monotonic()
 
     def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
-        """Write the final file, with the scalars of the evaluation and more mass tensors, each of shape
-        [n, n, n], and remove the partial one."""
+        """Write the final file, with the scalars of the evaluation and mass tensors, each of shape [n, n, n],
+        and remove the partial file."""
         result = dataclasses.replace(
             self.result,
             status="finished",
@@ -256,13 +256,13 @@ class RunFile:
         except NewerSchemaError:
             raise
         except ResultsError:
-            # Missing or damaged files are dealt with under the lock.
+            # Missing or damaged files are handled under the lock.
             return None
         same = earlier.config_hash == self._state[0].config_hash
         return earlier if same and earlier.status == "finished" else None
 
     def _take_up_earlier(self) -> None:
-        """Continue from an earlier process's state; files that cannot be used are moved aside."""
+        """Resume from an earlier process's state; unusable files are moved aside."""
         if (done := self._finished_earlier()) is not None:
             self._state = done, ()
             return
@@ -298,7 +298,7 @@ def _extended(
     extended = {}
     for name in dict.fromkeys((*columns, *rows[0])):
         new = [row.get(name, math.nan) for row in rows]
-        # Counts stay integers, all else is float64, whatever type of number a method gives.
+        # Counts are integers, all other columns are float64.
         counts = all(isinstance(number, int | np.integer) for number in new)
         added = np.array(new, np.int64 if counts else np.float64)
         before = columns.get(name, np.full(known, math.nan))
@@ -316,29 +316,29 @@ def _move_aside(path: Path, reason: ResultsError) -> None:
 # ------------------------------------------------------------------------------------------------------ locks
 
 _PATIENCE = 0.2
-"""Time that :func:`acquire` tries [s]: longer than :func:`held` holds a lock."""
+"""Timeout of :func:`acquire` [s], longer than :func:`held` holds a lock."""
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""Errors of file systems without locks."""
+"""Error numbers of file systems without locks."""
 
 
 class Lock:
-    """A lock that this process holds until :meth:`release`, or until nothing refers to this object."""
+    """A lock held by this process until :meth:`release` or garbage collection."""
 
     def __init__(self, lock: FileLock) -> None:
         self._lock = lock
 
     def release(self) -> None:
-        """Let go of the lock and remove its file; does nothing the second time."""
+        """Release the lock and remove its file; further calls have no effect."""
         if self._lock.is_locked:
-            # Windows does not remove open files, and a disk may have become read-only: an empty file stays.
+            # An empty file may remain on Windows, which cannot remove open files, and on read-only disks.
             with suppress(OSError):
                 Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release()
 
 
 def lock_path(path: str | Path) -> Path:
-    """Return the lock file of a run, by its final or partial result file."""
+    """Return the lock file of a run, given its final or partial result file."""
     path = Path(path)
     return path.with_name(path.name.removesuffix(".h5").removesuffix(".partial") + ".lock")
 
@@ -350,7 +350,7 @@ def acquire(path: str | Path) -> Lock | None:
         The lock, or None if another process, or another lock object of this process, holds it.
 
     Raises:
-        OSError: If the lock file cannot be made, or its file system has no locks.
+        OSError: If the lock file cannot be created, or its file system has no locks.
     """
     try:
         return _locked(lock_path(path), _PATIENCE)
@@ -359,18 +359,18 @@ def acquire(path: str | Path) -> Lock | None:
 
 
 def held(path: str | Path) -> bool:
-    """Return whether a process computes a run at this moment, by its final or partial result file."""
+    """Return True if a run is in progress, given its final or partial result file."""
     file = lock_path(path)
     if not file.exists():
         return False
     try:
-        # Nobody's: a killed process has left it, or its holder has removed it just before it was opened.
+        # Not locked: left by a killed process, or removed by its holder just before it was opened.
         _locked(file, 0.0).release()
     except Timeout:
         return True
     except OSError as error:
-        # Without lock support, no other process can hold it. A file that may not even be opened is somebody
-        # else's.
+        # Without lock support, no other process can hold it. A file that cannot be opened belongs to another
+        # user.
         return error.errno not in (*_NO_LOCKS, errno.EROFS)
     return False
 
@@ -378,11 +378,11 @@ def held(path: str | Path) -> bool:
 def _locked(file: Path, timeout: float) -> Lock:
     lock = FileLock(file, timeout=timeout, poll_interval=_PATIENCE / 8, thread_local=False)
     with warnings.catch_warnings():
-        # About the soft lock that is used where there are no locks.
+        # Warning about filelock's soft locks, used on file systems without locks.
         warnings.simplefilter("ignore")
         lock.acquire()
     if isinstance(lock, SoftFileLock):
-        # A soft lock that a killed process leaves is never free.
+        # The soft lock of a killed process would never be released.
         lock.release()
         raise OSError(errno.ENOSYS, "its file system has no locks: choose another results_dir")
     return Lock(lock)
@@ -401,18 +401,18 @@ _PACKAGES = (
     "h5py",
     "hydra-core",
 )
-"""Distributions with recorded versions. They are not imported: torch alone takes seconds."""
+"""Distributions with recorded versions. They are not imported, because torch alone takes seconds."""
 
 
 def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe the run that starts now.
+    """Return the provenance of a run that starts now.
 
     Args:
-        config: Resolved configuration; gives device, precision and seed.
+        config: Resolved configuration, with device, precision and seed.
 
     Returns:
         Flat scalars: versions, platform, commit, device, precision, seed, start time. ``git_commit`` is empty
-        where plab does not run from its repository.
+        outside plab's repository.
     """
     commit, dirty = _git()
     return {
@@ -432,7 +432,7 @@ def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def now() -> str:
-    """Return the time as results state it: UTC, ISO 8601, to the second."""
+    """Return the time in the format of results: UTC, ISO 8601, in seconds."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 

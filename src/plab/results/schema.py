@@ -27,7 +27,7 @@ PARTIAL_SUFFIX = ".partial.h5"
 PROGRESS_SUFFIX = ".progress"
 REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"
-"""Ends of the names of files of runs under way, of their progress and replay buffers, and of archives."""
+"""Suffixes of files of runs in progress, of their progress and replay buffers, and of archives."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 
@@ -52,38 +52,38 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
 """Keys of every configuration, and their types."""
 
 _NAME = re.compile(r"(?!/)(?!(?:.*/)?\.\.(?:/|$))[^\\\x00-\x1f\x7f]{1,200}")
-"""Names with which :func:`member_name` stays in its folder."""
+"""Names that are safe in :func:`member_name`."""
 
 
 class ResultsError(PlabError, RuntimeError):
-    """A result file that cannot be read or written; the message names the file and the reason."""
+    """A result file cannot be read or written; the message names the file and the reason."""
 
 
 class NewerSchemaError(ResultsError):
-    """A result file of a later schema version than this plab knows: it is never moved or replaced."""
+    """A result file has a newer schema version; it is never moved or replaced."""
 
 
 class RunBusyError(ResultsError):
-    """A run that another process computes at this moment."""
+    """A run is in progress in another process."""
 
     exit_code = 1
 
 
 @dataclasses.dataclass
 class RunResult:
-    """Everything that a result file holds.
+    """Content of a result file.
 
     Attributes:
         config: Resolved configuration, plain nested dictionaries.
         config_hash: :func:`config_hash` of ``config``.
         status: One of :data:`STATUSES`.
-        message: Why the run failed or stopped, one line; empty otherwise.
+        message: One-line reason why the run failed or stopped; empty otherwise.
         provenance: Versions, platform, commit, device, precision, seed, start time: flat scalars.
         wall_time: Seconds spent in each phase, summed over resumptions.
         columns: Columns of the iterations, or of the evaluations, shape [iteration] each; they are listed in
             docs/results.md.
         best_actions: Best actions found, in [-1, 1], shape [T, A]; None before the first iteration.
-        best_iteration: Iteration that ran them, -1 if none has.
+        best_iteration: Iteration of the best actions, -1 if there are none.
         best_loss: Their trajectory loss in the contact model of the rollouts.
         evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
         labels: Meaning and unit of the loss's terms, by column.
@@ -115,20 +115,20 @@ class RunResult:
 
     @property
     def iterations(self) -> pd.DataFrame:
-        """The columns as a table, a row per iteration, or per evaluation; to change it changes no column."""
-        # Imported here: a run that records its rows need not wait for pandas.
+        """The columns as a table, a row per iteration or evaluation; changes do not affect the columns."""
+        # Imported here, because recording a run does not need pandas.
         import pandas as pd
 
         return pd.DataFrame(self.columns)
 
     @property
     def score(self) -> float:
-        """Score of a finished run in [0, 1], as its protocol counts it.
+        """Score of a finished run under its protocol, in [0, 1].
 
-        With ``protocol.score=best`` that of the final evaluation; with ``last`` that of the last iteration,
-        in the contact model of the iterations, as the PlasticineLab release logs it: of a policy the mean of
-        its last training episodes, which explore. Methods that choose by the score themselves, such as
-        planners, and those outside plab always have that of the final one.
+        With ``protocol.score=best`` the score of the final evaluation; with ``last`` that of the last
+        iteration, in the contact model of the iterations, as logged by the PlasticineLab release; for
+        policies the mean over the last, exploratory training episodes. Methods that select by score, such as
+        planners, and external methods always use the final evaluation.
         """
         if scores_last_iteration(self.config):
             return last_score(self.columns)
@@ -136,10 +136,10 @@ class RunResult:
 
 
 def stored_config(text: str) -> dict[str, Any]:
-    """Return the configuration that a result file holds as ``text``.
+    """Parse the configuration in a result file.
 
     Raises:
-        ValueError: If it is no configuration of a run, or its names lead out of a folder.
+        ValueError: If it is not the configuration of a run, or its names would lead outside a folder.
     """
     config = json.loads(text)
     for key, kind in _NEEDED.items():
@@ -160,12 +160,12 @@ def scores_last_iteration(config: Mapping[str, Any]) -> bool:
 def last_score(rows: Mapping[str, np.ndarray]) -> float:
     """Return the score of the last of some iterations, given their columns, as it was simulated."""
     trained = rows.get("train_score", [np.nan])[-1]
-    # No episode of training may have ended.
+    # There may be no completed training episode.
     return float(rows["score"][-1] if np.isnan(trained) else trained)
 
 
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the columns of the terms of a configuration's loss: of those with a weight."""
+    """Return the columns of the loss terms of a configuration with nonzero weight."""
     return tuple(f"loss_{name}" for name, weight in config["method"]["loss_weights"].items() if weight)
 
 

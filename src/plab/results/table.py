@@ -1,7 +1,7 @@
 """Folders and archives of results as one table, a row per run, with an index of unchanged files.
 
-The index is a Parquet file read by DuckDB. It is never trusted over the files: an entry counts only while its
-file has the same size, inode and times of change. It is replaced atomically, and can be deleted at any time.
+The index is a Parquet file read by DuckDB. An entry is valid only while its file has the same size, inode and
+times. It is replaced atomically, and can be deleted at any time.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Row:
 
     @property
     def path(self) -> Path:
-        """Path of the run's file, or its place in an archive."""
+        """Path of the run's file, or of the member of an archive."""
         return Path(self.values["path"])
 
 
@@ -100,10 +100,10 @@ def load(
     warning.
 
     Args:
-        source: A folder, searched with its subfolders, an archive, a single result file, or several of them;
-            the texts ``example``, ``release``, ``targets`` and ``authors`` are archives that come with plab.
+        source: A folder, including subfolders, an archive, a single result file, or several of them; the
+            names ``example``, ``release``, ``targets`` and ``authors`` are bundled archives.
         keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
-        index: Take rows of unchanged files from the folder's index, and keep it up to date.
+        index: Use and update the index of the folder.
 
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
@@ -113,7 +113,7 @@ def load(
         or that of the last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or ``keys`` is a text.
+        ResultsError: If ``source`` does not exist, or ``keys`` is a text.
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
@@ -124,7 +124,7 @@ def load(
 
 
 def warn_of(unreadable: Sequence[ResultsError]) -> None:
-    """Name unreadable files in one warning, as if by the caller's caller."""
+    """Name unreadable files in one warning, attributed to the caller's caller."""
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)
         warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
@@ -135,7 +135,7 @@ def rows(
 ) -> tuple[list[Row], list[ResultsError]]:
     """Return the rows of :func:`load` with their configurations, and the errors of unreadable files.
 
-    A file is read in full before it has a row, so that its iterations and actions can be read afterwards.
+    Files are read in full first, so that their iterations and actions are known to be readable.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
@@ -158,8 +158,7 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
 
 
 def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return folders, archives and files; the text ``example`` and its like are archives that come with
-    plab."""
+    """Return folders, archives and files; names such as ``example`` are bundled archives."""
     given = [source] if isinstance(source, str | Path) else source
     return [resolve(one) if isinstance(one, str) else one for one in given]
 
@@ -168,7 +167,7 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
     """Read the iterations of many runs.
 
     Args:
-        paths: The runs' files or places in archives, as :func:`plab.results.load` gives them.
+        paths: Paths of runs, as in the column ``path`` of :func:`plab.results.load`.
 
     Returns:
         The columns of each run, shape [iteration] each, in the order of ``paths``.
@@ -192,8 +191,8 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
 
 
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
-    """Yield result files and archives of a folder with their status, in the order of their names, and folders
-    in it that may not be read; of a file, the file itself.
+    """Yield result files and archives of a folder with their status, sorted by name, and unreadable
+    subfolders; for a file, yield the file.
 
     Raises:
         ResultsError: If there is nothing at ``root``.
@@ -209,7 +208,8 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
         subfolders.sort()
         for name in sorted(name for name in names if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
-            # By text: pathlib takes longer than the file system. A run that ends removes its partial file.
+            # As text, because pathlib is slower than the file system. A run removes its partial file when it
+            # ends.
             path = os.path.join(folder, name)
             with suppress(FileNotFoundError):
                 yield Path(path), os.stat(path)
@@ -228,7 +228,7 @@ def read_each(
 
     Args:
         path: The file or archive.
-        extract: Function of the open file and its path, of a run in an archive its place there.
+        extract: Function of the open file and its path, or its path in an archive.
         wanted: Places to read; None for all.
     """
     try:
@@ -252,9 +252,9 @@ def read_each(
 
 
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, from the index where it has them."""
+    """Yield the rows of all files below a folder, or of one file, from the index if possible."""
     files = dict(run_files(root))
-    # A finished file takes the place of its partial one.
+    # A finished file replaces its partial file.
     for path in [path for path in files if path.name.endswith(PARTIAL_SUFFIX)]:
         if _final(path) in files:
             del files[path]
@@ -270,7 +270,7 @@ def _final(partial: Path) -> Path:
 
 
 def _read(path: Path) -> list[Row | ResultsError]:
-    """Return the rows of a file, of a partial one that has been replaced meanwhile those of the final one."""
+    """Return the rows of a file, or of the final file if a partial file has been replaced meanwhile."""
     entries = list(read_rows(path))
     if not path.exists():
         return list(read_rows(_final(path))) if _final(path).exists() else []
@@ -280,8 +280,8 @@ def _read(path: Path) -> list[Row | ResultsError]:
 def _without_repetitions(found: list[Row]) -> list[Row]:
     """Leave out runs superseded by a finished run of the same configuration.
 
-    Of loose files that are as good as each other all stay, of archived runs only the first, and none where
-    there is a loose one.
+    Among equivalent runs all separate files are kept, but only the first archived one, and none if there is a
+    separate file.
     """
     by_hash: dict[str, list[Row]] = defaultdict(list)
     for row in found:
@@ -301,7 +301,7 @@ def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, after checking that all columns and actions can be read."""
     config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), curves_of(file)
     actions_of(file)
-    # A method's section that cannot be counted is named here, not where a table is made.
+    # Invalid sections ``method`` are reported here instead of in tables.
     row_count(config["method"])
     evaluation, phases, origin = summary["evaluation"], summary["wall_time"], summary["provenance"]
     known = {
@@ -330,14 +330,14 @@ def _row(file: h5py.File, path: Path) -> Row:
 
 
 def _indexed(root: Path, files: Mapping[Path, os.stat_result]) -> Iterator[Row | ResultsError]:
-    """Yield the rows of files below a folder, from the index where a file has not changed."""
+    """Yield the rows of files below a folder, from the index for unchanged files."""
     place = _index_place(root)
     known = _stored(place)
     now, changed = time.time(), False
     kept: Index = {}
     for path, status in files.items():
         name = os.path.relpath(path, root)
-        # The time of the last change of the inode cannot be set back, unlike the modification time.
+        # The inode's change time cannot be set back, unlike the modification time.
         identity = f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
         entry = known.get(name)
         if entry is not None and entry[0] == identity:
@@ -350,7 +350,7 @@ def _indexed(root: Path, files: Mapping[Path, os.stat_result]) -> Iterator[Row |
         own = _read(path)
         yield from own
         found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
-        # Damaged files are read again: the message is part of the result.
+        # Damaged files are read again, because the message is part of the result.
         if own and len(found) == len(own) and now - status.st_mtime >= _TIMESTAMP_RESOLUTION:
             kept[name] = identity, [_index_entry(path, row) for row in found]
             changed = True
@@ -364,7 +364,7 @@ def _index_entry(path: Path, row: Row) -> tuple[str, str, str]:
 
 
 def _index_place(root: Path) -> Path:
-    """Return the path of the index: in the folder if that is writable, else in the user's cache folder."""
+    """Return the path of the index: in the folder if it is writable, otherwise in the user's cache folder."""
     if root.is_dir() and os.access(root, os.W_OK):
         return root / _INDEX
     digest = hashlib.sha256(os.fsencode(root.resolve())).hexdigest()[:16]
@@ -372,7 +372,7 @@ def _index_place(root: Path) -> Path:
 
 
 def _stored(place: Path) -> Index:
-    """Return the index; nothing if it is missing or damaged."""
+    """Return the index; empty if it is missing or damaged."""
     if not place.exists():
         return {}
     import duckdb
@@ -386,7 +386,7 @@ def _stored(place: Path) -> Index:
 
 
 def _write(place: Path, entries: Index) -> None:
-    """Replace the index; a folder that cannot be written has none."""
+    """Replace the index, if the folder is writable."""
     import duckdb
 
     table = [(name, identity, *parts) for name, (identity, own) in entries.items() for parts in own]

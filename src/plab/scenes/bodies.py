@@ -34,8 +34,7 @@ BODY_SHAPES = ("sphere", "box", "mesh")
 """Values of :attr:`Body.shape`."""
 
 MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
-"""Parameters that bodies share with their scene unless they have their own, as fields of a
-:class:`Material`."""
+"""Material parameters that bodies inherit from their scene by default, as fields of a :class:`Material`."""
 
 LAWS: Mapping[str, Law] = Registry(
     Law,
@@ -63,7 +62,7 @@ def find_law(name: str) -> Law:
     """Return a law by its name, or by ``module:NAME`` for a law outside plab.
 
     Raises:
-        plab.config.ConfigError: If there is none; one line.
+        plab.config.ConfigError: If it does not exist.
     """
     if name in LAWS:
         return LAWS[name]
@@ -73,7 +72,7 @@ def find_law(name: str) -> Law:
 
 
 class SceneError(PlabError, ValueError):
-    """A scene that cannot be simulated; the message says why and which value would do."""
+    """A scene cannot be simulated; the message has the reason and a valid value."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class Material:
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
         law: Name of the law, see :func:`find_law`.
-        parameters: Other parameters of the law, by name; defaults where none is given.
+        parameters: Other parameters of the law, by name; default: the law's.
     """
 
     youngs_modulus: float
@@ -135,7 +134,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of plasticine, filled with particles at t = 0.
+    """One body of plasticine, initially filled with particles.
 
     Attributes:
         shape: ``sphere`` or ``box``; that of a :class:`MeshBody` is ``mesh``.
@@ -165,7 +164,7 @@ class Body:
 
     @property
     def own_material(self) -> dict[str, Any]:
-        """Fields of its :class:`Material` that it does not share with the scene."""
+        """Fields of its :class:`Material` that differ from the scene's."""
         values = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law")}
         own = {key: value for key, value in values.items() if value is not None}
         return {**own, "parameters": self.parameters} if self.parameters else own
@@ -210,7 +209,7 @@ def make_body(
     sha256: str | None = None,
     **material: Any,
 ) -> Body:
-    """Make a body from a configuration's values, reading the file of a mesh.
+    """Create a body from a configuration, reading the mesh file if any.
 
     Args:
         shape: ``sphere``, ``box`` or ``mesh``.
@@ -220,10 +219,10 @@ def make_body(
         particles: Number of particles.
         file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
         sha256: SHA-256 of the file, likewise.
-        **material: Law and parameters that it does not share with the scene, as fields of the body.
+        **material: Its own law and parameters, as fields of the body.
 
     Raises:
-        SceneError: If a mesh has no file, or something else has one.
+        SceneError: If a mesh has no file, or another shape has one.
         plab.files.ShapeError: If the file cannot be used.
     """
     if shape != "mesh":
@@ -232,7 +231,7 @@ def make_body(
         return Body(shape, vector3(center), tuple(size), particles, **material)
     if file is None:
         raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
-    # Imported here: few scenes have meshes.
+    # Imported here, because few scenes have meshes.
     from plab.scenes.mesh import load_mesh
 
     return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256), **material)

@@ -22,7 +22,7 @@ class Camera:
         field_of_view: Vertical field of view [degrees], in (0, 180).
         size: Width and height of pictures [pixels].
         near: Near clipping depth [domain units], positive.
-        far: Depth beyond which nothing is seen [domain units]; the depth of pixels in which nothing is.
+        far: Far clipping depth [domain units], which is the depth of the background.
     """
 
     position: Vec3
@@ -36,7 +36,7 @@ class Camera:
         """Check the values.
 
         Raises:
-            SceneError: If there is no such camera; names the attribute.
+            SceneError: If an attribute is invalid; the message names it.
         """
         object.__setattr__(self, "position", vector3(self.position))
         object.__setattr__(self, "target", vector3(self.target))
@@ -81,7 +81,7 @@ class Camera:
         return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
 
     def project(self, points: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
-        """Return where points of the scene are in a picture.
+        """Project points of the scene into a picture.
 
         Args:
             points: Positions [domain units], shape [..., 3].
@@ -96,8 +96,8 @@ class Camera:
         return np.stack([width / 2 - scale * right / back, height / 2 + scale * up / back], axis=-1)
 
     def points(self, depth: np.ndarray) -> np.ndarray:
-        """Return the positions [domain units] that pixels show, shape [..., height, width, 3], from their
-        depth [domain units], shape [..., height, width]."""
+        """Convert depth [domain units], shape [..., height, width], to positions [domain units], shape [...,
+        height, width, 3]."""
         width, height = self.size
         x = (np.arange(width) + 0.5 - width / 2) / self.focal_length
         y = (height / 2 - np.arange(height) - 0.5) / self.focal_length

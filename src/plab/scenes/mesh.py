@@ -1,6 +1,6 @@
 """Solids bounded by a closed mesh of triangles: points inside, volume, thickness, random points.
 
-Random points are judged in plain float64 arithmetic: the same file gives the same points everywhere.
+Random points are tested in plain float64 arithmetic, so the same file gives the same points on all platforms.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ MESHES = (".obj", ".stl", ".ply")
 """Endings of mesh files."""
 
 _LEAST_SHARE = 1e-4
-"""Least share of its bounding box that a solid fills: points inside are found by rejection."""
+"""Least fraction of the bounding box filled by a solid, because points inside are found by rejection."""
 
 _BLOCK = 8192
-"""Points drawn at a time. Which of them are inside depends on it, so it must not change."""
+"""Number of points sampled at once. The samples depend on it, so it must not change."""
 
 _PAIRS = 1 << 21
-"""Pairs of a point and a triangle that are tested together, limited by their memory."""
+"""Number of point-triangle pairs tested at once, limited by memory."""
 
 _TRIED = 1 << 15
 """Number of sample points to compare the enclosed volume with that of the faces."""
 
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
-    """Return the mesh of a file; the same one as long as the file is the same.
+    """Return the mesh of a file, cached by content.
 
     Args:
         file: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
-        sha256: SHA-256 that it must have, likewise.
+        sha256: Expected SHA-256, likewise.
 
     Raises:
-        plab.files.ShapeError: If it cannot be read, or bounds no solid.
+        plab.files.ShapeError: If it cannot be read, or does not bound a solid.
     """
     return _loaded(*pinned(file, sha256))
 
@@ -67,7 +67,7 @@ def read_mesh(file: str, **options: Any) -> Any:
         plab.files.ShapeError: If it cannot be read, or trimesh is not installed.
     """
     try:
-        # Imported here: nothing else needs it, and it takes a second.
+        # Imported here, because it takes a second and is rarely needed.
         import trimesh
     except ImportError:
         raise ShapeError(f"{file} is read with trimesh: pip install 'plab[mesh]'") from None
@@ -77,10 +77,11 @@ def read_mesh(file: str, **options: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            # Read from memory: materials would be loaded from other files, named in this one.
+            # Read from memory, because the parser would otherwise load materials from files named in this
+            # one.
             content = io.BytesIO(Path(file).read_bytes())
             return trimesh.load(content, file_type=kind, process=False, skip_materials=True, **options)
-        # The parsers answer damage with whatever error they run into.
+        # The parsers raise arbitrary errors for damaged files.
         except Exception as error:
             raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
 
@@ -111,7 +112,7 @@ class Mesh:
             raise ShapeError(f"{file} has no faces")
         if faces.min() < 0 or faces.max() >= len(surface.vertices) or not np.isfinite(surface.vertices).all():
             raise ShapeError(f"{file} has vertices that do not exist or are not finite numbers")
-        # Formats without indices, and those with several normals at a corner, repeat a vertex.
+        # Formats without indices, or with several normals at a corner, repeat vertices.
         surface.merge_vertices(merge_tex=True, merge_norm=True)
         surface.update_faces(surface.nondegenerate_faces())
         if not surface.is_watertight:
@@ -155,7 +156,7 @@ class Mesh:
 
         Args:
             count: Number of points.
-            draw: Returns uniform random numbers in [0, 1) of a shape.
+            draw: Function that returns uniform random numbers in [0, 1) of a given shape.
 
         Returns:
             Positions, shape [count, 3].
@@ -168,14 +169,14 @@ class Mesh:
         return np.concatenate([np.empty((0, 3)), *parts])[:count]
 
     def _sort_into_squares(self) -> None:
-        """Sort the triangles into the squares of a grid in (x, z) that they reach."""
+        """Sort the triangles into the squares of a grid in (x, z) that they overlap."""
         corners = self.vertices[:, ::2][self.faces]
         low, high = corners.min(axis=1), corners.max(axis=1)
         self._squares = min(256, int(np.sqrt(len(self.faces) / 2)) + 1)
         while True:
             first, last = self._square(low), self._square(high)
             wide = last - first + 1
-            # Long triangles lie in many squares: fewer squares then.
+            # Long triangles overlap many squares, so use fewer squares.
             if self._squares == 1 or wide.prod(axis=1).sum() <= 8 * len(self.faces) + 65536:
                 break
             self._squares //= 2
@@ -189,14 +190,16 @@ class Mesh:
         return np.clip(((flat + 0.5) * self._squares).astype(np.int64), 0, self._squares - 1)
 
     def _crossings(self, at: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which vertical lines at (x, z), shape [pair, 2], cross a triangle each, shape [pair, 3]; and
-        of those that do, the heights and 1 or -1 for triangles that look up or down."""
+        """Intersect vertical lines at (x, z), shape [pair, 2], with one triangle each, shape [pair, 3].
+        Return the mask of crossings, and their heights and orientations, 1 for triangles facing up and -1 for
+        down."""
         flat = self.vertices[:, ::2]
         area, left = np.empty((3, len(at))), np.empty((3, len(at)), dtype=bool)
         for k in range(3):
             a, b = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
             turned = a > b
-            # Neighbours compute the same for the edge that they share: no line slips through between them.
+            # Neighbouring triangles compute the same values for a shared edge, so that no line passes between
+            # them.
             from_, to = flat[np.where(turned, b, a)], flat[np.where(turned, a, b)]
             edge, way = to - from_, at - from_
             cross = edge[:, 0] * way[:, 1] - edge[:, 1] * way[:, 0]
@@ -211,13 +214,13 @@ class Mesh:
         return met, height, np.where(down[met], -1, 1)
 
     def _require_volume(self, file: str) -> None:
-        """Refuse solids with too little volume to draw points in, and parts that overlap."""
+        """Reject solids with too little volume for sampling, and overlapping parts."""
         box = float(np.prod(self.extent))
         if not self.volume > _LEAST_SHARE * box:
             raise ShapeError(f"{file} has too little volume, {self.volume:.2g} of its longest edge's cube")
         points = (np.random.default_rng(0).random((_TRIED, 3)) - 0.5) * self.extent
         share, expected = float(self.inside(points).mean()), self.volume / box
-        # Four standard deviations of the count, and a little for overlaps that do no harm.
+        # Four standard deviations of the count, plus a tolerance for harmless overlaps.
         if abs(share - expected) > 0.02 * expected + 4 * np.sqrt(expected / _TRIED):
             raise ShapeError(
                 f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
@@ -226,6 +229,6 @@ class Mesh:
 
 
 def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each index as often as it counts, and the number of its repetition."""
+    """Repeat each index according to its count, and return the number of each repetition."""
     index = np.repeat(np.arange(len(counts)), counts)
     return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

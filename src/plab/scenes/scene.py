@@ -1,8 +1,8 @@
 """Scenes: bodies of plasticine, manipulators, material and floor.
 
-A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi,
-Hydra or Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start
-from it.
+A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It does not depend on Taichi,
+Hydra or Gymnasium, and is the input of the simulator, the reference implementation of the tests and the
+target recipes.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ CONTACTS = ("soft", "hard")
 Quaternion = tuple[float, float, float, float]
 
 ROLL_RADIUS = 0.03
-"""Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
+"""Distance travelled by a rolling pin per radian of roll, independent of its radius, as in the PlasticineLab
 release."""
 
 
@@ -106,7 +106,7 @@ class ManipulatorShape:
 
     @property
     def scaled(self) -> bool:
-        """True if its actions are shares of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
+        """True if its actions are multiples of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
         return self.motion != "twist"
 
     @property
@@ -161,7 +161,7 @@ MANIPULATOR_SHAPES |= {
 }
 
 MANIPULATORS_MAX = 31
-"""Maximum number of manipulators in a scene: those near a node are the bits of an integer."""
+"""Maximum number of manipulators in a scene, limited by a bit mask of manipulators near a node."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Manipulator:
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene of one environment, as the simulator takes it.
+    """Scene of one environment, the input of the simulator.
 
     Attributes:
         name: Task name, for messages.
@@ -243,7 +243,7 @@ class Scene:
         sampling_convention: Random generator of these positions, one of :data:`CONVENTIONS`.
         digits_convention: Treatment of rotations that are not quite of unit length, likewise: ``plab``
             normalises them, ``release`` keeps the initial poses unchanged until the first motion.
-        floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's reaches the
+        floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's includes the
             layer of nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
         kinematics: Articulated model whose links are the last manipulators; None without one.
     """
@@ -276,7 +276,7 @@ class Scene:
         """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab
         release.
 
-        It cancels in the motion and only scales the mass tensor, hence the loss.
+        It cancels in the motion and only scales the mass tensor and therefore the loss.
         """
         return (0.5 * self.dx) ** 2
 
@@ -292,12 +292,12 @@ class Scene:
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Materials of the bodies, one for each, whether they differ or not."""
+        """Materials of the bodies, one per body."""
         return tuple(replace(self.material, **body.own_material) for body in self.bodies)
 
     @property
     def material_count(self) -> int:
-        """Number of materials in the simulator: one per body where any body has its own, else 1."""
+        """Number of materials in the simulator: one per body if any body has its own, otherwise 1."""
         return len(self.bodies) if any(body.own_material for body in self.bodies) else 1
 
     @property
@@ -325,8 +325,8 @@ class Scene:
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Names of the components of the action vector: of the tools one after the other, by number, then
-        those of the articulated model."""
+        """Names of the components of the action vector: of the tools by number, then of the articulated
+        model."""
         own = [f"{k}_{name}" for k, tool in enumerate(self.tools) for name in tool.kind.action_names]
         return (*own, *(self.kinematics.components if self.kinematics else ()))
 
@@ -365,7 +365,7 @@ class Scene:
         """Check that the scene can be simulated.
 
         Raises:
-            SceneError: If it cannot; the message names the field and a value that can.
+            SceneError: If it cannot; the message names the field and a valid value.
         """
         _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
         self.material.validate()
@@ -418,7 +418,7 @@ class Scene:
         low = np.asarray(body.center) - body.half_extent()
         high = np.asarray(body.center) + body.half_extent()
         for axis, name in enumerate("xyz"):
-            # Bodies rest on the floor at y = 0 exactly; half a rounding error below it is not outside.
+            # Bodies rest on the floor at y = 0 exactly; rounding errors below it are tolerated.
             inside = low[axis] >= -1e-9 and high[axis] <= top + 1e-9
             half = body.half_extent()[axis]
             _require(
@@ -471,8 +471,7 @@ class Scene:
         self._require_slow(f"{label}: scale {manipulator.scale}", manipulator.largest_step())
 
     def _require_slow(self, label: str, way: float) -> None:
-        """Refuse a motion per environment step that contact, which acts on nodes, would not feel: of more
-        than a cell per substep."""
+        """Reject motions of more than one cell per substep, which contact at nodes could miss."""
         limit = self.substeps * self.dx
         if way > limit:
             raise SceneError(
@@ -500,15 +499,15 @@ def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
 
 
 def sample_particles(scene: Scene) -> np.ndarray:
-    """Draw the particles' initial positions, uniformly inside each body.
+    """Sample the initial particle positions, uniformly inside each body.
 
     Args:
-        scene: The scene; ``particle_seed``, ``sampling_convention`` and the bodies decide the result.
+        scene: The scene; They depend only on ``particle_seed``, ``sampling_convention`` and the bodies.
 
     Returns:
         Positions [domain units], shape [particle, 3], float64, body after body.
     """
-    # Equal to the release's to the last bit with seed 0, as no other generator's are.
+    # With seed 0 bitwise identical to the release's.
     release = scene.sampling_convention == "release"
     rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)
     parts = []

@@ -19,7 +19,7 @@ from plab.results.running import held
 from plab.results.table import readable_rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
-"""States of a run, best first; ``interrupted`` resumes when its command is given again."""
+"""States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""
 
 NAMES = ("task", "variant", "method", "seed")
 """Identity of a run."""
@@ -28,7 +28,7 @@ Key: TypeAlias = tuple[str, str, str, str]
 """Task, variant, method and seed of a run."""
 
 _RECENT_ROWS = 20
-"""Number of latest rows of a run under way from which its speed is estimated."""
+"""Number of latest rows used to estimate the speed of a run in progress."""
 
 
 @dataclass
@@ -42,14 +42,13 @@ class Run:
         seed: Seed of the method.
         state: One of :data:`STATES`.
         message: Reason of a failure; empty otherwise.
-        score: Score of a finished run, or that of the best row so far; None if there is none.
+        score: Score of a finished run, or of the best row so far; None if there is none.
         done: Iterations, or episodes, done.
-        total: Iterations, or episodes, in all; 0 where it is not known.
-        rate: Iterations, or episodes, per second of wall time [1/s], of a run under way; None if it is not
-            known.
+        total: Total number of iterations or episodes; 0 if unknown.
+        rate: Iterations or episodes per second of a run in progress [1/s]; None if it is not known.
         seconds: Wall time so far [s].
-        left: Time that it still needs [s], its share of a batch; None if it is not known.
-        together: Number of runs that share its process's time, if it is under way.
+        left: Remaining time [s], or its share of a batch; None if it is not known.
+        together: Number of runs in its process, if in progress.
         path: Its file; empty for a missing run.
     """
 
@@ -82,10 +81,10 @@ class Group:
         task: Name of the task.
         method: Name of the method.
         expected: Number of requested runs.
-        counts: Number of them in each of :data:`STATES`.
-        score: Mean score of those that are done; None if none is.
-        mean_seconds: Mean wall time of those that are done [s]; None if none is.
-        rate: Mean rate of those that are running [1/s]; None if none is.
+        counts: Number of runs in each of :data:`STATES`.
+        score: Mean score of finished runs; None if none is.
+        mean_seconds: Mean wall time of finished runs [s]; None if none is.
+        rate: Mean rate of running runs [1/s]; None if none is.
         left: Remaining time with one worker [s]; None if it is not known.
     """
 
@@ -124,17 +123,18 @@ class Survey:
 
     @property
     def workers(self) -> int:
-        """Number of processes at work: runs of a batch share one."""
+        """Number of active processes; runs of a batch share one."""
         return max(round(sum(1.0 / run.together for run in self.running)), 1) if self.running else 0
 
     @property
     def eta(self) -> float | None:
-        """Time until all is done [s], if as many processes stay at work; None if it is not known."""
+        """Remaining time until all runs are finished [s], with the current number of processes; None if it is
+        not known."""
         lefts = [group.left for group in self.groups]
         if not self.workers or None in lefts:
             return None
         left = sum(cast(list[float], lefts))
-        # No process can help another one.
+        # Processes do not share work.
         longest = max((run.left or 0.0) * run.together for run in self.running)
         return max(left / self.workers, longest)
 
@@ -144,14 +144,13 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
     Args:
         source: Folder of results, archive, or several.
-        chosen: Choice of runs: all combinations of the values that it names with the existing values of the
-            rest.
-        missing: Ask for the suite's tasks and variants, too, where ``chosen`` leaves them open, with the
-            methods and seeds that the results have, or the paper's if there are none.
+        chosen: Selection of runs: all combinations of its values with the existing values of other keys.
+        missing: Include all tasks and variants of the suite not restricted by ``chosen``, with the methods
+            and seeds of the results, or the paper's if there are none.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
-        ArgumentError: If there are runs of several protocols, or no run can be of the choice.
+        ResultsError: If ``source`` does not exist, or is an unreadable file or archive.
+        ArgumentError: If there are runs of several protocols, or the selection cannot match any run.
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
@@ -162,7 +161,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     others = 0
     for row in fitting:
         run = runs.get(_key(row.values))
-        # Of several settings of the same run the best one counts.
+        # Among several settings of the same run the best one counts.
         others += run is None or run.state != "missing"
         if run is not None:
             _take(run, row)
@@ -193,7 +192,7 @@ def _expected(present: Collection[Key], chosen: Selection, missing: bool) -> lis
         orders = place(task, tasks), place(method, PAPER_METHODS), place(variant, SUITE_VARIANTS)
         return *orders, len(seed), seed
 
-    # Values on the command line take the place of those that a run has.
+    # Given values replace those of the results.
     asked = (
         [chosen.choices.get(name, own) for name, own in zip(NAMES, values, strict=True)] for values in free
     )
@@ -207,7 +206,7 @@ def _key(values: Mapping[str, Any]) -> Key:
 
 
 def _take(run: Run, row: Row) -> None:
-    """Describe a run by a row of the results, unless a better one of the same run has come before."""
+    """Describe a run by a row of the results, unless a better row of the same run was found before."""
     state = "failed" if row.values["status"] == "failed" else "interrupted"
     if row.values["status"] == "finished":
         state = "done"
@@ -238,7 +237,7 @@ def _measure(run: Run) -> None:
         done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
         written = Path(run.path).stat().st_mtime
     except (ResultsError, OSError, KeyError):
-        # It may just have ended, and its partial file be gone.
+        # It may just have ended and removed its partial file.
         return
     run.seconds = float(sum(summary["wall_time"].values()))
     run.together = summary["provenance"].get("batch", 1)
@@ -263,7 +262,8 @@ def _measure(run: Run) -> None:
 
 
 def _group(task: str, method: str, own: Sequence[Run]) -> Group:
-    """Sum up the runs of a task and a method, and estimate the time left of those without a speed."""
+    """Summarise the runs of a task and a method, and estimate the remaining time of runs without a known
+    speed."""
     done = [run for run in own if run.state == "done"]
     seconds, score = _mean(run.seconds for run in done), _mean(run.score for run in done)
     for run in own:

@@ -20,14 +20,14 @@ INTERVAL = 1.0
 """Update interval [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
-"""Colours of states, in the order in which runs are shown where there is no room for all."""
+"""Colours of states, in order of priority if not all runs fit on the screen."""
 
 _AROUND = 6
-"""Lines of the screen that are not for runs."""
+"""Screen lines reserved for other output."""
 
 
 def duration(seconds: float | None) -> str:
-    """Write a time for people: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
+    """Format a time: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
     if seconds is None or not math.isfinite(seconds):
         return "?"
     if seconds < 100:
@@ -40,7 +40,7 @@ def duration(seconds: float | None) -> str:
 
 
 def show(found: Survey) -> None:
-    """Print a table by task and method, the runs under way and those that failed, and the sums."""
+    """Print a table by task and method, the running and failed runs, and totals."""
     console = Console() if sys.stdout.isatty() else Console(width=80)
     table = _table("task", "method", "done", "not done", "score", "mean time", "time left")
     for group in found.groups:
@@ -92,7 +92,7 @@ def _sums(found: Survey) -> list[str]:
 
 
 def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.sleep) -> None:
-    """Show all runs on a terminal until each is done or has failed; ``pause`` waits for some time [s].
+    """Show all runs on a terminal until each has finished or failed; ``pause`` waits for some time [s].
 
     Raises:
         plab.errors.ArgumentError: If there is no terminal.
@@ -110,7 +110,7 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
 
 
 def _screen(found: Survey, room: int) -> Group:
-    """Return a table with a line per run, as many as there is room for, and the sums."""
+    """Return a table with a line per run, as many as fit, and totals."""
     table = _table("run", "state", "done", "score", "rate", "time left")
     runs = found.runs
     if len(runs) > room:
@@ -121,7 +121,7 @@ def _screen(found: Survey, room: int) -> Group:
             state.append(f": {run.message}", "default")
         done = f"{run.done}/{run.total}" if run.total else ""
         rate = "" if run.rate is None else f"{run.rate:.3g}/s"
-        # Where runs share a process, each has to wait for the others.
+        # Runs that share a process wait for each other.
         left = duration(None if run.left is None else run.left * run.together)
         left = left if run.state == "running" else ""
         table.add_row(Text(run.name), state, done, _score(run.score), rate, left)

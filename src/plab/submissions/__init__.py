@@ -1,7 +1,7 @@
-"""Submissions to the leaderboard: recorded from any Gymnasium agent, packed, simulated again, shown.
+"""Submissions to the leaderboard: recording, packing, verification and display.
 
-``plab submit`` packs a method's results into one file, ``plab verify`` simulates them again,
-``plab leaderboard`` makes a page of many. docs/submissions.md shows the way.
+``plab submit`` packs a method's results into one file, ``plab verify`` simulates them again, ``plab
+leaderboard`` generates a page; see docs/submissions.md.
 """
 
 from plab.submissions.recorder import record

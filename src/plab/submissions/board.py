@@ -1,4 +1,4 @@
-"""Tables of the leaderboard: entries judged alike, with the paper's and plab's own."""
+"""Tables of the leaderboard: comparable entries, with the paper's and plab's own."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0
 OWN = Card("", ("plab contributors",), "", budget=0, hardware="NVIDIA H200", gradient=True)
 
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
-"""Environment steps of the paper's methods, with the gradient and without: its episodes have 50 steps."""
+"""Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
 
 TableKey: TypeAlias = tuple[str, str]
 """Set of configurations (``suite``, ``unseen`` or ``authors``) and protocol (``plab`` or ``release``)."""
 
 Point: TypeAlias = tuple[str, str, int, float, float]
-"""Task, variant, environment steps, score in float32 and in float64 (NaN if that is not known)."""
+"""Task, variant, environment steps, score in float32 and in float64 (NaN if unknown)."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class Line:
         track: ``plans`` or ``policies``.
         status: ``verified``, ``claimed``, ``printed`` (the paper's) or ``own runs`` (plab's).
         covered: Number of configurations with a score.
-        budgets: Mean score of all configurations of the table within each budget, one that is missing
-            counted as 0; None where there is nothing within it.
-        score: The same without a limit.
-        exact: The same in float64; None if that is not known.
+        budgets: Mean score of all configurations of the table within each budget; missing configurations
+            count as 0; None without entries.
+        score: Mean score without a limit.
+        exact: The same in float64; None if unknown.
         tasks: The same by task; None for tasks without a score.
     """
 
@@ -73,7 +73,7 @@ class Line:
 
 @dataclass(frozen=True)
 class BoardTable:
-    """A table: all its numbers are of one protocol and one set of targets.
+    """A table for one protocol and one set of targets.
 
     Attributes:
         title: Its heading.
@@ -90,7 +90,7 @@ class BoardTable:
 
 @dataclass(frozen=True)
 class Board:
-    """All tables, and a line for each file that is in none of them."""
+    """All tables, and a message for each file that is in none of them."""
 
     sections: tuple[BoardTable, ...]
     left_out: tuple[str, ...]
@@ -115,13 +115,13 @@ _TITLES: dict[TableKey, str] = {
     ("unseen", "release"): "Unseen configurations on the authors' terms",
 }
 _SHOWN_IF_EMPTY = 4
-"""Number of tables, from the first on, that are shown without lines, too."""
+"""Number of tables shown even if empty, from the first on."""
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     """Generate the leaderboard for a folder of submissions and their verifications by ``plab verify``.
 
-    Overrides are settings of every configuration that belongs here, if not plab's own.
+    Overrides of all configurations of the table.
 
     Raises:
         SubmissionError: If there is no such folder.
@@ -159,7 +159,7 @@ def _variants(kind: str) -> int:
 
 
 def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> Line:
-    """Summarise the points of a method in a table of some kind of configurations."""
+    """Summarise the results of a method for a table."""
     table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
     each = _variants(kind)
     expected = len(suite_tasks()) * each
@@ -191,10 +191,10 @@ def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Checks
 
 
 def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
-    """Yield the lines of a submission, with their tables.
+    """Yield the lines of a submission with their tables.
 
     Raises:
-        ResultsError: If it belongs into none.
+        ResultsError: If it belongs to no table.
     """
     submission = read(path)
     if submission.card is None:
@@ -203,7 +203,7 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
         what = f"physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
         raise SubmissionError(f"{path} is of {what}")
     for entry in submission.entries:
-        # The scene does not depend on the target, and the authors' files need not be here.
+        # The scene does not depend on the target, so the authors' files are not needed.
         known = _digests(replace(entry.configuration, targets="suite"), overrides)
         part = entry.digests.difference(known)
         if part == "scene" or (part and entry.configuration.targets == "suite"):
@@ -229,7 +229,7 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
 
 @functools.cache
 def _runs(archive: str) -> dict[Card, list[Row]]:
-    """Return the runs of gradient methods with seed 0 in an archive that comes with plab, by method."""
+    """Return the runs of gradient methods with seed 0 in a bundled archive, by method."""
     groups: dict[Card, list[Row]] = defaultdict(list)
     for row in readable_rows(example_archive(archive))[0]:
         look = method(row.values["method"])
@@ -249,7 +249,7 @@ def _point(row: Row, steps: int, score: str) -> Point:
 
 
 def _paper() -> BoardTable:
-    """Return the paper's table, with plab's runs that were judged in the same way."""
+    """Return the paper's table, with comparable runs of plab."""
     lines = []
     for name, rows in paper_table("iou_per_configuration").groupby("method", sort=False):
         look = method(str(name))

@@ -25,20 +25,19 @@ from plab.submissions.verifying import load_policy, play
 
 
 def submission_files(source: Path) -> list[Path]:
-    """Return the submissions, or recordings, in a folder and its subfolders; of a file, itself if it is
-    one."""
+    """Return the submissions or recordings in a folder and its subfolders, or a single file."""
     if source.is_file():
         return [source] if source.name.endswith(SUFFIX) else []
     return sorted(source.rglob(f"*{SUFFIX}"))
 
 
 def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
-    """Collect plans from folders of recordings, or from the chosen runs of folders, files and archives of
-    results, in the order of their configurations.
+    """Collect plans from folders of recordings, or from selected runs in folders, files and archives of
+    results, sorted by configuration.
 
     Raises:
-        SubmissionError: If there is nothing, or something twice.
-        plab.results.ResultsError: If something cannot be read.
+        SubmissionError: If there are none, or duplicates.
+        plab.results.ResultsError: If a file cannot be read.
     """
     found: dict[Configuration, Path] = {}
     entries: list[Entry] = []
@@ -75,7 +74,7 @@ def _of_run(row: Row) -> Entry:
 
 
 def steps_to_best(row: Row) -> int:
-    """Return after how many simulated environment steps a run found its best actions."""
+    """Return the number of environment steps simulated until a run found its best actions."""
     return int(load_rows(row.path)["simulated"][row.values["best_iteration"]])
 
 
@@ -87,14 +86,14 @@ def from_policies(
     Args:
         policies: Files of TorchScript (``.pt``) or ONNX (``.onnx``), by task. They are executed.
         variants: Variants to act in.
-        steps: Environment steps that the training of each took.
+        steps: Environment steps of the training of each policy.
         overrides: Overrides of every configuration.
 
     Returns:
         The entries, and the files by their names in the submission.
 
     Raises:
-        SubmissionError: If a policy cannot be read or run, or breaks the simulation off.
+        SubmissionError: If a policy cannot be read or run, or the simulation diverges.
         plab.config.ConfigError: If an override does not fit.
     """
     entries: list[Entry] = []

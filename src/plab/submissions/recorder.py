@@ -1,4 +1,4 @@
-"""Recordings of an agent's best plan within each budget, in a file per configuration.
+"""Recordings of an agent's best plan within each budget, one file per configuration.
 
 from plab.submissions import record
 
@@ -30,7 +30,8 @@ from plab.submissions.submission import (
 )
 
 _ledgers: dict[Path, _BestEpisodes] = {}
-"""Ledgers of this process by file: environments of one configuration share one, and their steps add up."""
+"""Recordings of this process by file; environments of one configuration share one, with a common count of
+steps."""
 
 Env = TypeVar("Env")
 
@@ -46,7 +47,7 @@ class _BestEpisodes:
         """Create the file.
 
         Raises:
-            SubmissionError: If there is a file already.
+            SubmissionError: If the file exists.
             ResultsError: If it cannot be written.
         """
         self.steps = 0
@@ -55,7 +56,7 @@ class _BestEpisodes:
         self._path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Without entries: two processes cannot both create it.
+            # Created empty, so that two processes cannot both create it.
             with path.open("xb") as file:
                 file.write(encode(Submission(None, ())))
         except FileExistsError:
@@ -65,7 +66,7 @@ class _BestEpisodes:
             raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
     def add(self, actions: np.ndarray, score: float) -> None:
-        """Take an episode into account: its actions, shape [T, A], and the score that they reached."""
+        """Add an episode: its actions, shape [T, A], and score."""
         better = [
             limit
             for limit in (*BUDGETS, math.inf)
@@ -82,20 +83,21 @@ class _BestEpisodes:
 def record(env: Env, folder: str | Path) -> Env:
     """Record the episodes of an agent, for ``plab submit``.
 
-    Of each configuration a file in ``folder`` holds the actions of the best episode within each budget of
-    :data:`plab.report.series.BUDGETS` and of the best one of all, with the environment steps simulated until
-    then. All environments of one configuration in a process share it. It is written whenever an episode is
-    better; episodes that are left before their end count by their steps.
+    For each configuration, a file in ``folder`` contains the actions of the best episode within each budget
+    of :data:`plab.report.series.BUDGETS` and overall, with the environment steps simulated until then. All
+    environments of one configuration in a process share it. It is written whenever an episode improves; the
+    steps of abandoned episodes count.
 
     Args:
         env: A single or vector environment of plab in the hard contact model, with any wrappers.
-        folder: Folder of the recordings, of this training only.
+        folder: Folder of the recordings, used by this training only.
 
     Returns:
         The same environment.
 
     Raises:
-        SubmissionError: If that cannot be recorded, or the folder has a recording of another process.
+        SubmissionError: If the environment cannot be recorded, or the folder has a recording of another
+            process.
         plab.results.ResultsError: If the file cannot be written.
     """
     inner = getattr(env, "unwrapped", None)
@@ -118,7 +120,7 @@ def record(env: Env, folder: str | Path) -> Env:
             ledger.steps += 1
         if "randomized" in result.info or not result.truncated.any():
             return
-        # Of an episode that has reached the horizon the last steps are all.
+        # The last steps of a complete episode are the whole episode.
         episodes = np.stack(taken, axis=1)
         for e in np.flatnonzero(result.truncated):
             if e not in result.failures:

@@ -1,6 +1,6 @@
 """Submissions: plans or policies with claimed scores, a card that describes the method, and their files.
 
-Nothing in a file is executed, and its size is bounded before it is unpacked.
+Nothing in a file is executed, and its size is checked before unpacking.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FORMAT = 1
 """Version of the layout; files of another one are not read."""
 
 TERMS = ("plab", "release")
-"""Protocols that decide about start, numbers and floor of a scene."""
+"""Protocols of submissions, which determine initial particles, numbers and floor of a scene."""
 
 TARGETS = ("suite", "authors")
 """Sources of targets: the suite's recipes, or the files of the original release."""
@@ -53,7 +53,7 @@ _CARD, _MANIFEST = "card.yaml", "manifest.json"
 
 
 class SubmissionError(ResultsError):
-    """A submission that cannot be read, written or judged; the message is one line."""
+    """A submission cannot be read, written or verified; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Card:
 
     Attributes:
         name: Name of the method.
-        authors: Names of those who submit it.
+        authors: Names of the authors.
         link: Paper, code or page, http or https.
-        budget: Environment steps simulated for all that is submitted, those of tuning included.
-        hardware: Hardware that it was computed on.
-        gradient: True if the simulator's gradient was used.
-        description: The method in a sentence or two; may be left out.
+        budget: Total number of simulated environment steps, including tuning.
+        hardware: Hardware used.
+        gradient: Whether the simulator's gradient was used.
+        description: The method in a sentence or two; optional.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Card:
 
 @dataclass(frozen=True, order=True)
 class Configuration:
-    """Task, variant, targets and protocol that can be submitted for.
+    """Task, variant, targets and protocol of an entry.
 
     Attributes:
         task: Name of the task.
@@ -109,7 +109,7 @@ class Configuration:
             plab.config.ConfigError: If an override does not fit.
             SubmissionError: If the authors' targets are needed, and not given.
         """
-        # A folder of the authors' files is only for their targets.
+        # The folder of the authors' files applies only to their targets.
         mine = tuple(word for word in overrides if not word.startswith("targets.source="))
         if self.targets == "authors":
             if mine == overrides:
@@ -121,7 +121,7 @@ class Configuration:
 
 
 def variant_words(task: str, variant: str) -> list[str]:
-    """Return the overrides that choose one of :data:`VARIANTS` of a task."""
+    """Return the overrides for one of :data:`VARIANTS` of a task."""
     if variant in UNSEEN:
         return [f"task={task}", "variant=random", f"seed_scene={variant.removeprefix('random')}"]
     return [f"task={task}", f"variant={variant}"]
@@ -153,8 +153,8 @@ class Checksums:
     """SHA-256, in hex, of scene and target, which together with the actions determine a score.
 
     Attributes:
-        scene: Of bodies, manipulators, material, discretisation and horizon.
-        target: Of the recipe, or of the authors' tensor.
+        scene: Checksum of bodies, manipulators, material, discretisation and horizon.
+        target: Checksum of the recipe, or of the authors' tensor.
     """
 
     scene: str
@@ -162,7 +162,7 @@ class Checksums:
 
     @classmethod
     def of(cls, cfg: Config) -> Checksums:
-        """Compute those of a configuration.
+        """Compute the checksums of a configuration.
 
         Raises:
             plab.targets.TargetError: If the authors' file cannot be read.
@@ -186,8 +186,8 @@ class Entry:
 
     Attributes:
         configuration: Its configuration.
-        digests: Those of its scene and target.
-        steps: Environment steps simulated until it was found, those with a gradient counted like others.
+        digests: Checksums of its scene and target.
+        steps: Number of environment steps simulated until it was found, with or without gradient.
         score: Claimed score in the hard contact model, in [0, 1].
         actions: The plan, in [-1, 1], shape [T, A]; None for a policy.
         policy: Name of the policy's file; empty for a plan.
@@ -214,10 +214,10 @@ class Submission:
         card: The method; None in recordings.
         entries: Plans, or policies.
         policies: Files of the policies, by name.
-        plab: Version of plab that wrote it.
+        plab: Version of plab that wrote the file.
         physics: Version of the physics, :data:`plab.targets.store.PHYSICS_VERSION`.
         path: The file.
-        digest: Its SHA-256, in hex; empty of one that has not been read from a file.
+        digest: SHA-256 of its file, in hex; empty if it was not read from a file.
     """
 
     card: Card | None
@@ -230,7 +230,7 @@ class Submission:
 
     @property
     def track(self) -> str:
-        """``policies`` if it holds some, else ``plans``."""
+        """``policies`` or ``plans``."""
         return "policies" if self.policies else "plans"
 
 
@@ -291,13 +291,13 @@ def parse_card(text: bytes, source: str) -> Card:
     """Read a card, YAML in UTF-8; messages name its ``source``.
 
     Raises:
-        SubmissionError: If it is no YAML or has mistakes.
+        SubmissionError: If it is not valid YAML or has errors.
     """
     try:
         if len(text) > _CARD_BYTES:
             raise UnreadableError(f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
         decoded = text.decode("utf-8")
-        # A few nested aliases can stand for more than memory holds.
+        # Nested aliases could expand to more than the memory.
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(decoded, yaml.SafeLoader)):
             raise UnreadableError("it must not have aliases (*)")
         record = yaml.safe_load(decoded)
@@ -313,7 +313,7 @@ def parse_card(text: bytes, source: str) -> Card:
 
 
 def write(submission: Submission, path: Path) -> None:
-    """Write a submission in one atomic step, as of this plab.
+    """Write a submission atomically, with the version of this plab.
 
     Raises:
         SubmissionError: If the name does not end in :data:`SUFFIX`.
@@ -325,7 +325,7 @@ def write(submission: Submission, path: Path) -> None:
 
 
 def encode(submission: Submission) -> bytes:
-    """Return the bytes of a submission's file, as of this plab."""
+    """Return the bytes of a submission file, with the version of this plab."""
     members: dict[str, bytes] = {}
     if submission.card is not None:
         card = asdict(submission.card) | {"authors": list(submission.card.authors)}
@@ -346,7 +346,7 @@ def encode(submission: Submission) -> bytes:
 
 
 def read(path: str | Path) -> Submission:
-    """Read a submission; nothing in it is executed, and whether its claims hold is not judged.
+    """Read a submission, without executing anything or verifying its claims.
 
     Raises:
         SubmissionError: If the file is missing, cut off, too large, of another layout or malformed.
@@ -380,7 +380,7 @@ def read_members(path: Path) -> dict[str, bytes]:
     """Read all of a zip file into memory; return the content of each member by name.
 
     Raises:
-        UnreadableError: If it unpacks to more than is allowed; see also :func:`plab.files.opened_zip`.
+        UnreadableError: If it exceeds the size limit; see also :func:`plab.files.opened_zip`.
         ValueError: If it is cut off, damaged or encrypted.
         OSError: If it cannot be opened.
     """
@@ -396,7 +396,7 @@ def inconsistency(submission: Submission) -> str | None:
     if submission.policies and any(entry.actions is not None for entry in submission.entries):
         return "it holds plans and policies: submit them apart"
     seen: set[tuple[Configuration, int]] = set()
-    # A policy is trained once for all its configurations, a plan for its own.
+    # A policy is trained once for all its configurations, a plan for a single one.
     spent: dict[Any, int] = {}
     for entry in submission.entries:
         if (entry.configuration, entry.steps) in seen:
@@ -424,7 +424,7 @@ def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
         return Entry(configuration, digests, *claim, policy=file)
     try:
         actions = np.load(io.BytesIO(members[file]), allow_pickle=False)
-    # NumPy answers damage with whatever error its parser runs into.
+    # NumPy raises arbitrary errors for damaged files.
     except Exception as error:
         raise UnreadableError(f"{file} is no NumPy file, or cut off ({one_line(error)})") from None
     if not isinstance(actions, np.ndarray) or actions.dtype != "<f8" or actions.ndim != 2 or not actions.size:

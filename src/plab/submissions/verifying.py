@@ -1,4 +1,4 @@
-"""Verification of submissions: every claim is simulated again, in float32 and in float64.
+"""Verification of submissions by simulating all claims again, in float32 and in float64.
 
 Policies are TorchScript or ONNX. Loading a policy executes it, so this happens only on request.
 """
@@ -35,8 +35,8 @@ from plab.submissions.submission import (
 from plab.targets.store import PHYSICS_VERSION
 
 TOLERANCE = 0.02
-"""Largest difference between a claimed score and the simulated one: on the CPU the same actions give the same
-bits, on CUDA the last digits vary and contact magnifies them."""
+"""Tolerance between claimed and simulated scores. The CPU is bitwise reproducible; on CUDA the last digits
+vary, amplified by contact."""
 
 OUTCOMES = HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
 
@@ -62,7 +62,7 @@ class Verdict:
         entry: The claim.
         scores: Simulated score by precision; empty if it was not run.
         outcome: One of :data:`OUTCOMES`.
-        why: A line, unless it holds.
+        why: One-line reason, empty if it holds.
     """
 
     entry: Entry
@@ -78,7 +78,7 @@ class Verification:
     Attributes:
         digest: SHA-256 of the submission, in hex.
         verdicts: A verdict for each entry, in the order of the file.
-        overrides: Overrides that it was simulated with.
+        overrides: Overrides of the simulation.
     """
 
     digest: str
@@ -98,13 +98,14 @@ def verify(
     run_policies: bool = False,
     precisions: Sequence[str] = PRECISIONS,
 ) -> Verification:
-    """Simulate all of a submission again, with overrides such as ``sim.device=cuda``, in some precisions.
+    """Simulate all entries of a submission again, with overrides such as ``sim.device=cuda``, in the given
+    precisions.
 
-    The policies in it are other people's programs, and executed with ``run_policies`` only.
+    Its policies are programs from others, executed only with ``run_policies``.
 
     Raises:
-        SubmissionError: If it is of other physics, scenes or targets than these, or its plans or policies
-            are not for their tasks.
+        SubmissionError: If its physics, scenes or targets differ, or its plans or policies do not fit their
+            tasks.
         plab.config.ConfigError: If an override does not fit.
     """
     given = tuple(overrides)
@@ -169,7 +170,7 @@ def _verdict(entry: Entry, played: Mapping[str, ReplayedScore]) -> Verdict:
 def play(
     cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], precision: str, name: str = ""
 ) -> list[ReplayedScore]:
-    """Play plans or a policy in several configurations of one task, in the hard contact model.
+    """Simulate plans or a policy in several configurations of one task, in the hard contact model.
 
     Args:
         cfgs: The configurations.
@@ -178,8 +179,8 @@ def play(
         name: Name of the policy in messages.
 
     Raises:
-        SubmissionError: If a plan has not as many steps or components as its task, or the policy cannot be
-            run, gives actions that do not fit, or answers the same observation twice differently.
+        SubmissionError: If a plan has a wrong shape, or the policy cannot be run, returns invalid actions, or
+            is not deterministic.
     """
     played: list[ReplayedScore] = []
     for start in range(0, len(cfgs), _BATCH):
@@ -220,9 +221,9 @@ def _check_policy(policy: Policy, observations: np.ndarray, name: str, component
 
 
 def load_policy(name: str, content: bytes) -> Policy:
-    """Load a policy, TorchScript (``.pt``) or ONNX (``.onnx``) by the ending of its file's name.
+    """Load a policy, TorchScript (``.pt``) or ONNX (``.onnx``) according to its suffix.
 
-    It returns as many finite actions as there are observations, in [-1, 1], or raises SubmissionError.
+    It returns one finite action in [-1, 1] per observation, or raises SubmissionError.
 
     Raises:
         SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.
@@ -270,7 +271,7 @@ def _onnx(content: bytes) -> Policy:
 
 
 def _reason(error: Exception) -> str:
-    """Return the last line of an error's message: PyTorch puts the reason there, below its trace."""
+    """Return the last line of an error's message, which has the reason in PyTorch."""
     return (str(error).strip() or type(error).__name__).splitlines()[-1].strip()[:200]
 
 
@@ -313,7 +314,7 @@ def write_verification(verification: Verification, submission: Path) -> Path:
 
 
 def read_verification(submission: Submission) -> Verification | None:
-    """Return the verification of a submission; None if this very file was not verified with these physics.
+    """Return the verification of a submission; None if this file was not verified with the current physics.
 
     Raises:
         SubmissionError: If the verification file cannot be read.

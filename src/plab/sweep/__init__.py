@@ -1,4 +1,4 @@
-"""Sweeps: many runs by one command, in batches that share a simulator, without losing or repeating any.
+"""Sweeps: execution of many runs in batches that share a simulator.
 
-Nothing is imported here: the command line starts without torch.
+Nothing is imported here, so that the command line starts without torch.
 """

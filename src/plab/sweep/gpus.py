@@ -54,7 +54,7 @@ class _Worker:
 def gpu_workers(
     per_gpu: int, most: int, look_up: Callable[[Config], Outcome]
 ) -> Iterator[tuple[Callable[..., Iterator[Outcome]], int]]:
-    """Start processes on all GPUs that this process may use; afterwards they end.
+    """Start processes on all available GPUs, for the duration of the ``with`` block.
 
     Args:
         per_gpu: Number of processes of each GPU.
@@ -62,7 +62,7 @@ def gpu_workers(
         look_up: Function that returns the outcome of a run whose process was killed.
 
     Yields:
-        Function that carries out batches by them, and the number of processes.
+        Function that executes batches with them, and the number of processes.
 
     Raises:
         ConfigError: If there is no GPU.
@@ -71,7 +71,7 @@ def gpu_workers(
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):
         raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
-    # One process for each GPU before any has its second.
+    # Processes are distributed evenly over GPUs.
     places = names * per_gpu
     workers = [_Worker(name) for name in places[:most]]
     try:
@@ -107,7 +107,7 @@ def _dispatch(
             try:
                 yield from future.result()
             except BrokenProcessPool:
-                # Killed: the files know how far it came.
+                # Killed: the result files have its progress.
                 worker.restart()
                 yield from map(look_up, batch)
 
@@ -118,8 +118,8 @@ def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequen
 
     Args:
         waiting: Batches, at least one.
-        own: The kind that the process had before, if any.
-        others: The kinds that the others have, or had before.
+        own: Kind of the process's last batch, if any.
+        others: Kinds of the other processes' batches.
     """
     kinds = [_kind(batch) for batch in waiting]
     return kinds.index(own if own in kinds else min(kinds, key=others.count))
@@ -154,7 +154,7 @@ def _carry_out(batch: list[Config], note: str) -> list[Outcome]:
 
 
 def _end_with_parent() -> None:
-    """End this process, and its locks, as soon as the one that has started it is gone."""
+    """End this process, releasing its locks, when its parent ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Sweeps: all combinations of values as runs, composed, batched, carried out, and how each ended."""
+"""Sweeps: composition of all combinations of values, batching, execution, and outcomes."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ from plab.sweep.gpus import gpu_workers
 from plab.targets import TargetError
 
 Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
-"""Function that carries out batches, given them and the sweep's progress as a text, and yields outcomes."""
+"""Function that executes batches, given a text for progress, and yields outcomes."""
 
 
 def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = None) -> int:
-    """Run all combinations of the values that overrides give, and report how the runs ended.
+    """Run all combinations of the values in overrides, and report the outcomes.
 
     Args:
         words: Prepared overrides.
-        master: Configuration with Hydra's own section, which has the parameters of an experiment and the
-            settings of the launcher.
+        master: Configuration with Hydra's section, which has the parameters of an experiment and the settings
+            of the launcher.
         config_dir: Folder with files of the user's own.
 
     Returns:
@@ -76,7 +76,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         carry, processes = carry_here, 1
         if settings["inner"] is not None:
             carry = partial(_carry_elsewhere, master, settings["inner"], by_path)
-            # As joblib counts: -1 is one for each core.
+            # As in joblib, -1 means one per core.
             wanted = settings["inner"].get("n_jobs", 1)
             processes = wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
         else:
@@ -95,7 +95,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
 
 def _launcher_settings(launcher: DictConfig) -> Mapping[str, Any]:
     if "_target_" in launcher:
-        # One of Hydra's: a job per run.
+        # A launcher of Hydra, with one job per run.
         return {"inner": launcher, "batch_size": 1, "per_gpu": 0}
     for name, least in (("batch_size", 1), ("per_gpu", 0)):
         value = launcher[name]
@@ -116,8 +116,8 @@ def jobs_of(
     """Return the overrides of each run of a sweep.
 
     Args:
-        words: Prepared overrides; those of Hydra's settings are left out.
-        parameters: Values by key of an experiment, which overrides narrow.
+        words: Prepared overrides; Hydra's settings are ignored.
+        parameters: Values by key of an experiment, restricted by overrides.
         config_dir: Folder with files of the user's own.
     """
     parsed = parse([*(f"{key}={value}" for key, value in parameters.items()), *words])
@@ -136,12 +136,12 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
         config_dir: Folder with files of the user's own.
 
     Returns:
-        Configuration of each job, or why there is none.
+        Configuration of each job, or its error.
     """
     finished: dict[tuple[str, ...], Config | str] = {}
     entries: list[Config | Outcome] = []
     for job in jobs:
-        # Nothing else in a configuration depends on the seed.
+        # No other value of a configuration depends on the seed.
         seeds = [word for word in job if re.fullmatch(r"seed=\d{1,9}", word)]
         words = tuple(word for word in job if word not in seeds)
         if words not in finished:
@@ -173,19 +173,19 @@ def plan(
 ) -> list[list[Config]]:
     """Put configurations into batches.
 
-    Together go runs of one task by methods that differ in optimiser and contact model only, or that learn
-    from rewards and do not differ: any variants, any seeds, any material. Runs of methods that cannot share a
-    simulator are batches of one, those of a kind one after the other.
+    Runs of one task share a batch if their methods differ only in optimiser and contact model, or are equal
+    learning methods; variants, seeds and materials may differ. Runs of other methods form batches of one,
+    ordered by kind.
 
     Args:
         cfgs: The composed and checked configurations.
-        size: Largest number of runs in a batch; None: as many as fit, trajectories and planners in
-            ``sim.memory_mb``, agents in half of the device's memory.
+        size: Largest number of runs in a batch; default: as many as fit into ``sim.memory_mb`` (trajectories
+            and planners) or half of the device's memory (agents).
         processes: Number of processes; each gets a batch if there are enough runs.
-        sharing: Number of processes that share a device, and its memory.
+        sharing: Number of processes that share the memory of a device.
 
     Returns:
-        Batches, each as evenly filled as the others of its kind.
+        Batches, evenly filled within each kind.
     """
     groups: dict[str, list[Config]] = {}
     for cfg, scene in zip(cfgs, build_scenes(cfgs), strict=True):
@@ -198,7 +198,7 @@ def plan(
 
 
 def _kind(cfg: Config, scene: Scene) -> list[Any]:
-    """Return the settings that runs of a batch, or successive batches of one, have in common."""
+    """Return the settings that must agree within a batch, or between successive batches of a simulator."""
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
@@ -207,7 +207,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     own = family(cfg.method.family)
     if not own.batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
-    # Runs of other lengths would have environments wait for each other, and agents learn in step.
+    # Runs of different lengths would leave environments idle, and agents are trained in lockstep.
     alike = method if own.in_step else row_count(method)
     return [*kind, alike, *scene_kind(scene)]
 
@@ -220,7 +220,7 @@ def _limit(cfg: Config, size: int | None, sharing: int) -> int:
         return size
     if not own.in_step:
         return batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
-    # Agents need no gradient, so sim.memory_mb, the budget of one, is none of theirs.
+    # Agents need no gradient, so its budget sim.memory_mb does not apply.
     room = most_environments(scene, cfg.sim.precision, cfg.sim.device) // sharing
     return max(1, room // asdict(cfg.method)["num_envs"])
 
@@ -234,18 +234,18 @@ def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
 def run_batches(
     cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1, sharing: int = 1
 ) -> Iterator[Outcome]:
-    """Carry out the runs of a sweep that are not finished, and yield how each ended.
+    """Execute the unfinished runs of a sweep, and yield outcomes.
 
-    Runs that another process computes are left to it. Should it end before they do, they are taken up here.
+    Runs in progress in other processes are skipped. If that process ends early, they are resumed here.
 
     Args:
         cfgs: Their configurations.
         carry: Carries out batches.
-        size: Largest number of runs in a batch; None: as many as fit the memory.
-        processes: Number of batches carried out at a time.
-        sharing: Number of these that use one device.
+        size: Largest number of runs in a batch; default: limited by memory.
+        processes: Number of batches executed concurrently.
+        sharing: Number of these per device.
     """
-    # The same run given twice is one run.
+    # Duplicates count once.
     wanted = {str(cfg.path): cfg for cfg in cfgs}
     ended: dict[str, Outcome] = {}
     for path, cfg in wanted.items():
@@ -268,7 +268,7 @@ def run_batches(
 
 
 def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
-    """Carry out batches in this process, one after the other."""
+    """Execute batches sequentially in this process."""
     cache = SimulatorCache()
     for batch in batches:
         yield from runners.run_batch(batch, progress(), cache)
@@ -281,7 +281,7 @@ def _carry_elsewhere(
     batches: list[list[Config]],
     _progress: Callable[[], str],
 ) -> Iterator[Outcome]:
-    """Hand batches to a launcher of Hydra's, one job each, given the overrides of each run by its file."""
+    """Submit batches to a launcher of Hydra, one job each, given the overrides of each run by file."""
     config = deepcopy(master)
     with open_dict(config.hydra):
         config.hydra.launcher = inner
@@ -306,7 +306,7 @@ def _carry_elsewhere(
 
 
 def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Outcome]:
-    """Carry out the batch of a launcher's job, in that job's process."""
+    """Execute the batch of a launcher's job, in its process."""
     number = HydraConfig.get().job.num
     note = f"[batch {number + 1}/{len(batches)}] " if len(batches) > 1 else ""
     return runners.run_batch(batches[number], note, SimulatorCache())

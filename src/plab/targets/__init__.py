@@ -1,8 +1,7 @@
-"""Target recipes: the shapes that the plasticine is to take, as mass tensors.
+"""Target recipes, which generate mass tensors.
 
-A recipe is a dataclass; :data:`RECIPES` lists them by the name that a task's YAML gives as ``target.recipe``.
-The remaining keys of ``target`` are the dataclass's fields. ``plab targets`` builds the targets of
-the suite.
+A recipe is a dataclass; :data:`RECIPES` has them by name, as in ``target.recipe`` of a task's YAML. The
+remaining keys of ``target`` are the dataclass's fields. ``plab targets`` builds the targets of the suite.
 """
 
 from plab.targets.build import (

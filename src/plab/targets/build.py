@@ -31,11 +31,11 @@ RECIPES: Mapping[str, type[Recipe]] = Registry(
         for name in names
     },
 )
-"""Recipes by the name that ``target.recipe`` gives."""
+"""Recipes by name, as in ``target.recipe``."""
 
 
 def make_recipe(target: Mapping[str, Any]) -> Recipe:
-    """Turn the ``target`` section of a task into its recipe.
+    """Convert the section ``target`` of a task to its recipe.
 
     Args:
         target: ``recipe`` and the recipe's parameters.
@@ -51,7 +51,7 @@ def make_recipe(target: Mapping[str, Any]) -> Recipe:
 
 @functools.lru_cache(maxsize=64)
 def _made(pickled: bytes) -> Recipe:
-    """Make the recipe of a pickled ``target`` section, once: OmegaConf takes milliseconds."""
+    """Create the recipe of a pickled section ``target``, cached because OmegaConf takes milliseconds."""
     parameters = pickle.loads(pickled)
     name = parameters.pop("recipe", None)
     kind = RECIPES.get(str(name))
@@ -67,8 +67,8 @@ def _made(pickled: bytes) -> Recipe:
 
 
 def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the actions that make a scripted target, in [-1, 1], shape [EPISODE_STEPS, A]; None for a
-    target that need not be simulated.
+    """Return the actions of a scripted target, in [-1, 1], shape [EPISODE_STEPS, A]; None for a target
+    without simulation.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
@@ -78,15 +78,14 @@ def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
-    """Find every mistake in a ``target`` section that can be found without simulating; see
-    :func:`demonstration` for arguments and errors."""
+    """Check a section ``target`` without simulation; see :func:`demonstration` for arguments and errors."""
     if demonstration(scene, target) is None:
         build_target(scene, target)
     _target_scene(scene, make_recipe(target))
 
 
 def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
-    """Return the mass tensor of a scene's target that need not be simulated, shape [n, n, n], float64.
+    """Return the mass tensor of a target without simulation, shape [n, n, n], float64.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value, the shape leaves the
@@ -103,10 +102,10 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
 def build_targets(
     simulator: Simulator, targets: Sequence[Mapping[str, Any]], *, rebuild: bool = False
 ) -> np.ndarray:
-    """Build the targets of a simulator's environments, simulating those that are scripted.
+    """Build the targets of a simulator's environments, simulating scripted ones.
 
-    Simulated targets are cached on disk, so that the second time costs nothing. The simulator is left in its
-    initial state, in the hard contact model if it had to simulate.
+    Simulated targets are cached on disk. The simulator is left in its initial state, in the hard contact
+    model if targets were simulated.
 
     Args:
         simulator: Simulator of the scenes that the targets belong to.
@@ -118,11 +117,11 @@ def build_targets(
 
     Raises:
         TargetError: See :func:`build_target`.
-        plab.sim.SimulationError: If a demonstration makes the state not finite.
+        plab.sim.SimulationError: If the simulation of a demonstration diverges.
     """
     store, own = TargetStore(simulator), simulator.scenes
     scenes = [_target_scene(scene, make_recipe(target)) for scene, target in zip(own, targets, strict=True)]
-    # Vectorised environments are many of one kind: each kind is built once.
+    # Vectorised environments are often equal, so each kind is built once.
     kinds = [(scene, id(target)) for scene, target in zip(scenes, targets, strict=True)]
     masses: dict[tuple[Scene, int], np.ndarray] = {}
     missing: dict[tuple[Scene, int], np.ndarray] = {}
@@ -150,7 +149,7 @@ def build_targets(
 
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
-    """Return the scene that a target is made from: draw 0 of the particles, in the recipe's material."""
+    """Return the scene for simulating a target, with particle seed 0 and the recipe's material."""
     material: dict[str, Any] = getattr(recipe, "material", {})
     made_from = replace(scene, particle_seed=0, **material)
     if material:

@@ -20,14 +20,15 @@ from plab.objective import spread_mass
 from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
 
 TARGET_SEED = 1
-"""Seed of a target's samples; not the scene's, or a target could be a shifted copy of the bodies."""
+"""Seed of a target's samples; different from the scene's, so that targets are not shifted copies of the
+bodies."""
 
 EPISODE_STEPS = 50
-"""Environment steps of the suite's episodes, hence of its scripted demonstrations."""
+"""Environment steps of the suite's episodes and scripted demonstrations."""
 
 
 class TargetError(PlabError, ValueError):
-    """A target that cannot be built; the message says why."""
+    """A target cannot be built; the message has the reason."""
 
 
 class Recipe:
@@ -35,7 +36,7 @@ class Recipe:
 
 
 class TensorRecipe(Recipe, ABC):
-    """A target that need not be simulated."""
+    """A target without simulation."""
 
     @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
@@ -47,11 +48,11 @@ class TensorRecipe(Recipe, ABC):
 
 
 class PointsRecipe(TensorRecipe):
-    """A target made of points that share the mass of the scene's particles."""
+    """A target made of points with the total mass of the scene's particles."""
 
     @abstractmethod
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """Draw or read the points; positions [domain units], shape [point, 3]."""
+        """Sample or read the points; positions [domain units], shape [point, 3]."""
 
     def mass(self, scene: Scene) -> np.ndarray:
         points = self.sample(scene, np.random.default_rng(TARGET_SEED))
@@ -98,7 +99,7 @@ class BodiesTarget(PointsRecipe):
     """Solid bodies of uniform density.
 
     Attributes:
-        bodies: The bodies, by name; the scene's particles are shared out in proportion to their volumes.
+        bodies: The bodies, by name; the scene's particles are divided in proportion to their volumes.
     """
 
     bodies: dict[str, TargetBody]
@@ -169,13 +170,13 @@ class RingTarget(PointsRecipe):
 
 
 _LARGEST_HOLLOW = 0.02
-"""Share of a solid's cells that its points may leave empty around."""
+"""Maximum fraction of hollow cells of a solid."""
 
 _POINTS_PER_CELL = 8
-"""Points of a cell of a solid that is filled."""
+"""Points per cell of a filled solid."""
 
 _NEGATIVE = 1e-3
-"""Share of a mass tensor that rounding may have put below zero."""
+"""Maximum fraction of negative mass from rounding."""
 
 _MEASURED = 1000
 """Maximum number of points used to measure spacing."""
@@ -207,7 +208,7 @@ class PointsTarget(PointsRecipe):
             raise TargetError(f"target: {error}") from None
         some = points[:: -(-len(points) // _MEASURED)]
         distance = float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
-        # Farther apart, they would be dots on the grid instead of a solid.
+        # Points farther apart would be isolated dots on the grid.
         if distance > scene.dx:
             raise TargetError(
                 f"target: half of the points of {self.file} have no other within {distance:.2g}, more than a "
@@ -233,7 +234,7 @@ def _filled(points: np.ndarray, n: int) -> tuple[np.ndarray, float]:
 
     cells = np.zeros((n, n, n), bool)
     cells[tuple((points * n).astype(int).clip(0, n - 1).T)] = True
-    # Between points of a cell's distance are cells without any.
+    # Points at the distance of a cell leave empty cells in between.
     closed = binary_closing(np.pad(cells, 2), np.ones((3, 3, 3)))[2:-2, 2:-2, 2:-2] | cells
     solid = binary_fill_holes(closed)
     return solid, float((solid & ~binary_dilation(closed)).sum() / solid.sum())

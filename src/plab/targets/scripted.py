@@ -1,8 +1,8 @@
-"""Scripted target recipes: the scene after a demonstration that is drawn from a seed.
+"""Scripted target recipes: the final state of a demonstration sampled with a seed.
 
-Each recipe draws the manipulators' ways from the ranges in the task's YAML and turns them into actions; the
-target is the plasticine after those actions in the hard contact model. So every such configuration can be
-solved, and its solution is known.
+Each recipe samples the paths of the manipulators from the ranges in the task's YAML and converts them to
+actions; the target is the final shape in the hard contact model. Such configurations are therefore solvable,
+with a known solution.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ DECIMALS = 4
 
 
 class _TooLong(Exception):
-    """A way that does not fit into an episode."""
+    """A path does not fit into an episode."""
 
 
 class ActionTrack:
-    """Actions of one manipulator, built up way by way."""
+    """Actions of one manipulator, built from a sequence of motions."""
 
     def __init__(self, manipulator: Manipulator) -> None:
-        """Start at the manipulator's place with no step taken."""
+        """Start at the manipulator's position without steps."""
         self._scale = np.asarray(manipulator.scale)
         self._actions: list[np.ndarray] = []
 
@@ -50,7 +50,7 @@ class ActionTrack:
         way = np.asarray(way, dtype=float)
         # A component that cannot move has scale 0.
         share = np.divide(way, self._scale, out=np.zeros_like(way), where=self._scale > 0)
-        # A hair less, or rounding would cost a step where the way fits exactly.
+        # Slightly less, because rounding would add a step if the distance fits exactly.
         steps = max(steps, math.ceil(np.abs(share).max() - 1e-9), 1)
         self._actions += [share / steps] * steps
 
@@ -59,11 +59,11 @@ class ActionTrack:
         self._actions += [np.zeros_like(self._scale)] * (until - len(self))
 
     def delay(self) -> None:
-        """Put the whole way off, so that it ends with the episode."""
+        """Delay the whole motion, so that it ends with the episode."""
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; _TooLong if they are more."""
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; _TooLong if there are more."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
@@ -80,8 +80,8 @@ class Script(Recipe, ABC):
 
     Attributes:
         seed: Seed of the draws, >= 0.
-        youngs_modulus: Young's modulus E during the demonstration; the scene's if None, and so on. Bodies
-            with their own material keep it.
+        youngs_modulus: Young's modulus E during the demonstration; default: the scene's, as for the following
+            keys. Bodies with their own material keep it.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress.
     """
@@ -93,7 +93,7 @@ class Script(Recipe, ABC):
 
     @property
     def material(self) -> dict[str, float]:
-        """Material of the demonstration where it is not the scene's, by the names of
+        """Material parameters that differ from the scene's, by the names of
         :data:`plab.scenes.MATERIAL_KEYS`."""
         values = {key: getattr(self, key) for key in MATERIAL_KEYS}
         return {key: value for key, value in values.items() if value is not None}
@@ -103,19 +103,19 @@ class Script(Recipe, ABC):
         """Draw the demonstration's actions.
 
         Args:
-            scene: The scene that is handled.
+            scene: The scene.
 
         Returns:
             Actions in [-1, 1], shape [EPISODE_STEPS, A].
 
         Raises:
-            TargetError: If a parameter has a wrong value, or no drawn way fits into an episode.
+            TargetError: If a parameter has a wrong value, or no sampled path fits into an episode.
         """
 
 
 @dataclass
 class PlannedScript(Script):
-    """A demonstration that draws one way for each manipulator."""
+    """A demonstration with one sampled path per manipulator."""
 
     def actions(self, scene: Scene) -> np.ndarray:
         """See :meth:`Script.actions`."""
@@ -137,16 +137,16 @@ class PlannedScript(Script):
 
     @abstractmethod
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """Draw one way for each manipulator that can move."""
+        """Sample one path for each moving manipulator."""
 
 
 @dataclass
 class PressTarget(PlannedScript):
-    """A manipulator comes down on the first body, off its centre, and goes up again.
+    """A manipulator descends onto the first body, off its centre, and rises again.
 
     Attributes:
         offset: Range of the distance from the body's centre, in x and in z [domain units].
-        depth: Range of how deep it goes below the body's top [domain units].
+        depth: Range of the depth below the body's top [domain units].
     """
 
     offset: list[float]
@@ -165,12 +165,12 @@ class PressTarget(PlannedScript):
 
 @dataclass
 class DrawTarget(PlannedScript):
-    """A pen draws straight strokes over the first body's top, one where the last ended, and is lifted.
+    """A pen draws connected straight strokes on the first body's top, and is lifted.
 
     Attributes:
         strokes: Range of their number, both ends included.
         length: Range of a stroke's length [domain units].
-        margin: Least distance of their ends from the body's edges [domain units].
+        margin: Least distance of stroke ends from the body's edges [domain units].
         depth: Range of the tip's depth below the body's top [domain units].
     """
 
@@ -193,7 +193,7 @@ class DrawTarget(PlannedScript):
         track.go([0.0, depth + tool.size[1], 0.0])
 
     def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw a stroke [2] from a place [2] that ends within +-room [2] of the body's centre."""
+        """Sample a stroke [2] from a position [2] that ends within +-room [2] of the body's centre."""
         for _ in range(DRAWS):
             angle, length = rng.uniform(0, 2 * math.pi), _draw(rng, "length", self.length)
             way = length * np.array([math.cos(angle), math.sin(angle)])
@@ -208,8 +208,8 @@ class DentTarget(PlannedScript):
 
     Attributes:
         dents: Range of their number, both ends included.
-        elevation: Range of the angle above the horizontal that they come from [rad].
-        azimuth: Range of the angle about the vertical that they come from, from x towards z [rad].
+        elevation: Range of the approach angle above the horizontal [rad].
+        azimuth: Range of the approach angle about the vertical, from x towards z [rad].
         depth: Range of a dent's depth [domain units].
     """
 
@@ -242,12 +242,12 @@ class DentTarget(PlannedScript):
 
 @dataclass
 class RollTarget(PlannedScript):
-    """A rolling pin goes to and fro over the first body while it comes down.
+    """A rolling pin moves back and forth over the first body while descending.
 
     Attributes:
-        reach: Range of its way from the middle to either side [domain units].
-        depth: Range of how far it comes down over the episode [domain units].
-        yaw: Range of its turn about the vertical over the episode [rad].
+        reach: Range of the displacement from the middle to either side [domain units].
+        depth: Range of the descent over the episode [domain units].
+        yaw: Range of the rotation about the vertical over the episode [rad].
     """
 
     reach: list[float]
@@ -269,13 +269,13 @@ class RollTarget(PlannedScript):
 
 @dataclass
 class LiftTarget(PlannedScript):
-    """Chopsticks lift the first body, move it sideways and turn it, so that its ends hang and trail.
+    """Chopsticks lift the first body, move it sideways and rotate it, so that its ends hang and trail.
 
     Attributes:
-        height: Range of how far they lift [domain units].
-        turn: Range of the turn about the vertical, to either side [rad].
-        x: Range of the way along x, to either side [domain units].
-        z: Range of the way along z [domain units].
+        height: Range of the lift [domain units].
+        turn: Range of the rotation about the vertical, to either side [rad].
+        x: Range of the displacement along x, to either side [domain units].
+        z: Range of the displacement along z [domain units].
     """
 
     height: list[float]
@@ -288,7 +288,7 @@ class LiftTarget(PlannedScript):
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
         turn, x = _draw(rng, "turn", self.turn), _draw(rng, "x", self.x)
         sides = rng.choice([-1.0, 1.0], size=2)
-        # Any faster, and the body slips through.
+        # With faster motion the body slips.
         lift = 20
         track.go([0.0, height, 0.0, 0.0, 0.0, 0.0, 0.0], lift)
         track.go([sides[0] * x, 0.0, z, 0.0, sides[1] * turn, 0.0, 0.0], EPISODE_STEPS - 10 - lift)
@@ -296,11 +296,11 @@ class LiftTarget(PlannedScript):
 
 @dataclass
 class CarryTarget(PlannedScript):
-    """Two spheres grip the last body, set it on the first and let go.
+    """Two spheres grip the last body, set it on the first and release it.
 
     Attributes:
-        squeeze: Range of how far either sphere presses into the body before the lift [domain units].
-        press: Range of how far it is pressed onto the other [domain units].
+        squeeze: Range of the depth to which each sphere presses into the body before the lift [domain units].
+        press: Range of the depth to which it is pressed onto the other body [domain units].
     """
 
     squeeze: list[float]
@@ -332,9 +332,9 @@ class PushTarget(PlannedScript):
     of the table stays where it is.
 
     Attributes:
-        legs: So many of the scene's first bodies are legs.
+        legs: Number of legs, which are the scene's first bodies.
         distance: Range of the distance travelled after contact with the leg [domain units].
-        steps: Environment steps that this takes at least; with more, the table follows.
+        steps: Least number of environment steps; with more, the table follows.
     """
 
     legs: int
@@ -361,9 +361,9 @@ class Posture:
     """Joint positions at the end of a part of a gesture.
 
     Attributes:
-        joints: Ranges of positions by patterns of joints; joints of one pattern share one draw, of where
-            between the ends of its range. Others stay where they are.
-        steps: Environment steps to get there, at least.
+        joints: Ranges of positions by patterns of joints; joints of one pattern share one sample of the
+            relative position within the range. Other joints do not move.
+        steps: Least number of environment steps.
     """
 
     joints: dict[str, list[float]]
@@ -372,7 +372,7 @@ class Posture:
 
 @dataclass
 class GestureTarget(Script):
-    """An articulated model goes through postures, one after the other, and stays in the last.
+    """An articulated model moves through a sequence of postures, and stays in the last.
 
     Attributes:
         postures: The postures, in order.
@@ -422,14 +422,14 @@ class GestureTarget(Script):
 
 
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
-    """Draw uniformly from a range [low, high]; all of a recipe's ranges are checked here."""
+    """Sample uniformly from a range [low, high], after checking the range."""
     if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
         raise TargetError(f"target.{name} must be a range [low, high], not {list(limits)}")
     return rng.uniform(limits[0], limits[1])
 
 
 def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
-    """Draw a whole number from a range, both ends included."""
+    """Sample an integer from a range, inclusive."""
     if len(limits) != 2 or not 1 <= limits[0] <= limits[1]:
         raise TargetError(f"target.{name} must be a range [low, high] from 1 on, not {list(limits)}")
     return int(rng.integers(limits[0], limits[1] + 1))
@@ -445,15 +445,15 @@ def _top(body: Body) -> float:
 
 
 def _below(tool: Manipulator) -> float:
-    """Distance that an upright manipulator reaches below its position [domain units]."""
+    """Extent of an upright manipulator below its position [domain units]."""
     if tool.kind.support is None:
         raise TargetError(f"the recipe needs a manipulator that presses with its lower end, not {tool.shape}")
     return float(tool.kind.support(tool.size, np.array([0.0, -1.0, 0.0])))
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
-    """Distance from the centre of a box, of half edges [3], at which a sphere meets it that comes from a
-    direction [3] [domain units]."""
+    """Distance from the centre of a box, with half edges [3], at which a sphere approaching from a direction
+    [3] makes contact [domain units]."""
     ways = np.linspace(0.0, np.linalg.norm(half) + radius, 1000)
     gaps = np.linalg.norm(np.maximum(ways[:, None] * np.abs(direction) - half, 0.0), axis=1)
     return float(np.interp(radius, gaps, ways))

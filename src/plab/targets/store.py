@@ -21,16 +21,17 @@ if TYPE_CHECKING:
     from plab.sim import Simulator
 
 PHYSICS_VERSION = 1
-"""Version of the physics, raised when results change by more than rounding: cached targets are then stale."""
+"""Version of the physics, incremented when results change by more than rounding, which invalidates cached
+targets."""
 
 RELEASE_PARTICLES = 10000
-"""Particle masses that each of the release's targets holds, whatever the scene has."""
+"""Total mass of the release's targets [particle masses], independent of the scene."""
 
 MASS_TOLERANCE = 0.02
 """Largest relative error of a release target's total mass."""
 
 NEGATIVE_PARTICLES = 3.0
-"""Particle masses that the negative masses of a release target may add up to.
+"""Largest total of negative masses of a release target [particle masses].
 
 They come from the release's stencil: truncated toward zero, it has a weight of -0.25 for a particle at the
 lower face of the domain, and down to -1.5 for the stray particles outside in three of the fifty targets.
@@ -41,19 +42,19 @@ class TargetStore:
     """Cache of simulated targets, keyed by scene, actions, precision, device and physics."""
 
     def __init__(self, simulator: Simulator) -> None:
-        """Open the store for targets that this simulator makes: precision and device are part of the key."""
+        """Open the store for a simulator, with its precision and device as part of the key."""
         self._made_by = (simulator.precision, simulator.device)
 
     def path(self, scene: Scene, actions: np.ndarray) -> Path:
-        """Return the file of the target that a demonstration, shape [T, A], makes of a scene."""
-        # The horizon plays no part; a mesh counts by its content.
+        """Return the file of the target for a scene and a demonstration, shape [T, A]."""
+        # The horizon is ignored; meshes are identified by content.
         facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
         text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
         digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
         return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
 
     def load(self, scene: Scene, actions: np.ndarray) -> np.ndarray | None:
-        """Return a target's mass tensor, shape [n, n, n], or None if it is not there or not readable."""
+        """Return a target's mass tensor, shape [n, n, n], or None if it is missing or unreadable."""
         n = scene.grid_size
         try:
             kept = read_arrays(self.path(scene, actions))
@@ -64,7 +65,7 @@ class TargetStore:
         return mass.reshape(n, n, n) if np.isfinite(mass).all() and mass.any() else None
 
     def save(self, scene: Scene, actions: np.ndarray, mass: np.ndarray) -> None:
-        """Keep a mass tensor, shape [n, n, n]; where the folder cannot be written, do nothing."""
+        """Store a mass tensor, shape [n, n, n], if the folder is writable."""
         path = self.path(scene, actions)
         node = np.flatnonzero(mass)
         try:
@@ -73,7 +74,7 @@ class TargetStore:
                 np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
             os.replace(file.name, path)
         except OSError:
-            # The target is made again next time.
+            # The target will be regenerated next time.
             return
 
 
@@ -86,11 +87,11 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
         variant: Number of the variant.
 
     Returns:
-        Mass tensor, shape [n, n, n], float64. A few masses may be negative: the files were made with the
-        release's stencil.
+        Mass tensor, shape [n, n, n], float64. A few masses may be negative, because the files were made with
+        the release's stencil.
 
     Raises:
-        TargetError: If the file is missing, or no mass tensor of this scene.
+        TargetError: If the file is missing or does not fit this scene.
     """
     name = "Rollingpin" if scene.name == "RollingPin" else scene.name
     path = Path(folder) / f"{name}3D-v{variant}.npy"

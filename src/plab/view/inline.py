@@ -1,4 +1,4 @@
-"""The page inside a notebook: an object that Jupyter shows as the viewer itself."""
+"""The 3-D viewer inside a notebook."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def show(
     surface: bool = False,
     height: int = _HEIGHT,
 ) -> Viewer:
-    """Simulate a rollout in the hard contact model, and return it for a notebook to show in 3-D.
+    """Simulate a rollout in the hard contact model, and return it for 3-D display in a notebook.
 
-    Beside simulators that are there already it runs on their device and in their precision, whatever the
-    configuration says: Taichi has one of each at a time, and with another they would lose their memory.
+    If other simulators exist, it uses their device and precision, because Taichi supports only one of each at
+    a time, and a change would invalidate them.
 
     Args:
         what: A result file, to replay its best actions; or a configuration.
-        actions: Actions in [-1, 1] for the configuration, shape [T, A]; None: the best that are known for its
-            task, or an episode of zeros where none are.
-        every: Environment steps from one frame to the next, between which the viewer interpolates; None: so
-            many that there are no more than 60 frames.
+        actions: Actions in [-1, 1] for the configuration, shape [T, A]; default: the best known actions for
+            its task, or zeros.
+        every: Environment steps between frames, interpolated by the viewer; None: so many that there are no
+            more than 60 frames.
         surface: Show plasticine as smooth surfaces instead of its particles.
         height: Height of the viewer [pixels].
 

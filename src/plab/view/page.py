@@ -1,4 +1,4 @@
-"""Pages in 3-D: particles, manipulators and target as K3D-jupyter's objects, and a bar to play them with."""
+"""3-D pages: particles, manipulators and target as objects of K3D-jupyter, with playback controls."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
 
 _FRAMES = 60
-_POSITIONS = 600_000  # of particles in all frames together: some 6 MB of the page
+_POSITIONS = 600_000  # particles in all frames together: about 6 MB of the page
 _VERTICES = 300_000  # of surfaces, likewise
 _LEVELS = 2**16  # per domain unit, to which positions are rounded for compression
 _STEPS_PER_SECOND = 10
-_ASPECT = 4 / 3  # of the window that the camera is fitted to; the page moves it away in a narrower one
+_ASPECT = 4 / 3  # aspect ratio for the camera; the page moves the camera back in narrower windows
 _GHOST_OPACITY = 0.3
-_OVERLAP = 1.2  # diameter of a particle, in mean distances of neighbours
+_OVERLAP = 1.2  # diameter of a particle, in mean particle spacings
 _FLOOR = np.linspace(0.0, 1.0, 11)  # where its lines are [domain units]
 _LINE = 0.0012  # their width [domain units]
 _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -45,15 +45,15 @@ _LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt
 
 
 def page(recording: RecordedRollout, every: int | None = None, *, surface: bool = False) -> str:
-    """Return a page that plays a rollout, below 10 MB whatever its length.
+    """Return a page that plays a rollout, smaller than 10 MB for any length.
 
-    Positions are rounded to 16 bits per domain unit. Of very many particles every second or third is shown;
+    Positions are rounded to 16 bits per domain unit. With many particles, every second or third is shown;
     large surfaces are simplified.
 
     Args:
         recording: The rollout.
-        every: Environment steps from one frame to the next, between which the page interpolates particles;
-            None: so many that there are no more than 60 frames.
+        every: Environment steps between frames, with interpolated particles; None: so many that there are no
+            more than 60 frames.
         surface: Show plasticine as smooth surfaces instead of its particles.
 
     Returns:
@@ -83,17 +83,17 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
     bodies = (_surfaces if surface else _particles)(recording, steps)
     things = [*bodies, *_manipulators(recording, steps), *_target_mesh(recording), _floor()]
     for number, thing in enumerate(things, start=1):
-        # Not where it lies in memory: the same rollout gives the same page.
+        # Independent of memory addresses, so that the same rollout gives the same page.
         thing.id = number
         plot += thing
     snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
-    # The page sets the camera itself, when it knows how wide its window is.
+    # The page sets the camera according to the width of its window.
     seen = [*camera.position, *camera.target, 0.0, 1.0, 0.0]
     return _with_bar(snapshot, recording, seen, {thing.group for thing in things}, interpolate=not surface)
 
 
 def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
-    """Return a page of links to pages, given by name, file and score; the first is open."""
+    """Return an index of pages, given by name, file and score; the first is open."""
     return _template("gallery.html").render(pages=pages)
 
 
@@ -222,5 +222,5 @@ def _template(name: str) -> Template:
 
 
 def _number(color: str) -> int:
-    """Return a colour, ``#rrggbb``, as K3D-jupyter has it."""
+    """Convert a colour, ``#rrggbb``, to K3D-jupyter's format."""
     return int(color[1:], 16)

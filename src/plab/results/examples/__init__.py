@@ -1,4 +1,4 @@
-"""Real results and measurements that come with plab, to see tables, curves, notebooks and pages at once.
+"""Bundled results and measurements, as examples for tables, curves, notebooks and pages.
 
 ``README.md`` in this folder describes the content and origin of each file.
 """
@@ -16,22 +16,22 @@ with the release's initial particles."""
 
 
 def example_archive(name: str = EXAMPLES[0]) -> Path:
-    """Return an archive of real results, by one of :data:`EXAMPLES`."""
+    """Return a bundled archive by its name in :data:`EXAMPLES`."""
     return Path(__file__).with_name(f"{name}.plab.zip.xz")
 
 
 def resolve(source: str | Path) -> Path:
-    """Return a source of results, the archive where it is one of the words :data:`EXAMPLES`; a folder of that
-    name is meant by ``./example``."""
+    """Return a source of results, a bundled archive for the names :data:`EXAMPLES`; use ``./example`` for a
+    folder of that name."""
     return _relative(example_archive(str(source))) if str(source) in EXAMPLES else Path(source)
 
 
 def measurements(folder: str | Path) -> Path:
-    """Return a folder with files of benchmarks, plab's own where it is one of the words :data:`EXAMPLES`."""
+    """Return a folder of benchmark files, the bundled ones for the names :data:`EXAMPLES`."""
     return _relative(Path(__file__).parent) if str(folder) in EXAMPLES else Path(folder)
 
 
 def _relative(path: Path) -> Path:
-    """Shorten a path for reports, which are not to name folders of the computer without need."""
+    """Shorten a path for reports, to not reveal local folders."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
