@@ -100,7 +100,7 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
     if x.ndim != 2 or x.shape[1] != 3:
         raise ArgumentError(f"positions have shape {list(x.shape)}, not [particle, 3]")
     scaled = x * n
-    # Written so that NaN fails it, too. Outside these limits a particle contributes to nodes below -1 or
+    # NaN must fail this comparison, too. Outside these limits a particle contributes to nodes below -1 or
     # above n - 1.
     if not np.all((scaled >= -0.5) & (scaled < n - 1.5)):
         raise ArgumentError(
@@ -132,7 +132,7 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     Raises:
         ValueError: If no node exceeds the threshold.
     """
-    # Imported here: SciPy's start-up would be paid by every `--help`.
+    # Imported here, because SciPy would slow down every `--help`.
     from scipy.ndimage import distance_transform_edt
 
     mass = np.asarray(mass, dtype=np.float64)
@@ -162,7 +162,7 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
     if a.shape != b.shape:
         raise ArgumentError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
     largest_a, largest_b = a.max(initial=0.0), b.max(initial=0.0)
-    # Written so that NaN fails it, too.
+    # NaN must fail this comparison, too.
     if not (0.0 < largest_a < np.inf and 0.0 < largest_b < np.inf):
         raise ArgumentError(
             f"mass tensors need finite mass somewhere: their maxima are {largest_a:g} and {largest_b:g}"
@@ -198,7 +198,7 @@ def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PO
     Returns:
         Distance [domain units]; 0 for equal tensors.
     """
-    # Imported here: SciPy's start-up would be paid by every `--help`.
+    # Imported here, because SciPy would slow down every `--help`.
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
@@ -288,7 +288,7 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
 def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return missing (positive) and excess (negative) mass by node, as fractions of all mass, shape [n, n,
     n]. Both mass tensors are normalised and smoothed, because particles are sampled at random."""
-    # Imported here: SciPy's start-up would be paid by every `--help`.
+    # Imported here, because SciPy would slow down every `--help`.
     from scipy.ndimage import gaussian_filter
 
     change = target / target.sum() - start / start.sum()

@@ -39,7 +39,7 @@ else:
 
 
 class Registry(UserDict[str, Any]):
-    """Objects by name, each given as ``module:NAME`` and imported when it is first asked for."""
+    """Objects by name, given as ``module:NAME`` and imported on first access."""
 
     def __init__(self, kind: type, places: Mapping[str, str]) -> None:
         """Keep the places of instances of ``kind``; ``type`` for classes."""

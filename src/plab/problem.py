@@ -55,7 +55,7 @@ class Episodes:
         final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
         scores: Scores of each environment.
         gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
-        failures: Environments that broke off, with time and reason; their numbers mean nothing.
+        failures: Diverged environments, with time and reason; their values are meaningless.
     """
 
     term_names: tuple[str, ...]
@@ -78,7 +78,7 @@ class BatchMeasures:
             and ``score``, as in the columns of results.
         final_loss: Weighted loss of the last step, shape [batch].
         gradient: Gradient of ``loss``, shape [batch, T, A], or None.
-        failures: Environments that broke off, with time and reason; their numbers mean nothing.
+        failures: Diverged environments, with time and reason; their values are meaningless.
     """
 
     measures: dict[str, Any]
@@ -121,7 +121,7 @@ def make_simulator(
     Raises:
         plab.config.ConfigError: If a loss term does not exist.
         plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
-        plab.sim.DeviceError: If CUDA was asked for and is not there.
+        plab.sim.DeviceError: If CUDA is not available.
     """
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
     sim, method = cfgs[0].sim, cfgs[0].method
@@ -173,7 +173,7 @@ class Problem:
             plab.config.ConfigError: If the configurations are incompatible.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
-            plab.sim.DeviceError: If CUDA was asked for and is not there.
+            plab.sim.DeviceError: If CUDA is not available.
         """
         _require_alike(cfgs)
         # Vectorised environments and seeds of a sweep often have equal scenes, which are built once.

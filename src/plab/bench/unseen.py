@@ -32,8 +32,8 @@ FIRST = 10_000
 
 
 def scores_of(policy: Policy, cfgs: Sequence[Config], batch: EpisodeBatch) -> np.ndarray:
-    """Return the scores of a policy in the hard contact model, shape [configuration]; of episodes that break
-    off 0."""
+    """Return the scores of a policy in the hard contact model, shape [configuration]; 0 for diverged
+    episodes."""
     found: list[float] = []
     for first in range(0, len(cfgs), batch.size):
         own = cfgs[first : first + batch.size]
@@ -57,11 +57,11 @@ def rows(
     """Measure policies, one after the other.
 
     Args:
-        policies: By name: policy, overrides of its configuration, and what it was trained on.
+        policies: By name: policy, overrides of its configuration, and training scenes.
         count: Scenes.
         together: Scenes simulated at a time.
         words: Further overrides.
-        observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`.
+        observe: Observations, see :class:`plab.envs.core.EpisodeBatch`.
     """
     # Imported here, because SciPy would slow down every `--help`.
     from scipy import stats
@@ -69,7 +69,7 @@ def rows(
     for name, (policy, own, trained_on) in policies.items():
         cfg = load_config([*own, *words])
         every = drawn_configs(cfg, range(FIRST, FIRST + count))
-        # Building them says what is wrong with all of them.
+        # Errors of these scenes are raised when they are built.
         drawn = [one for one in every if fits(one)] or every
         if len(drawn) < 2:
             raise ArgumentError(
@@ -88,7 +88,7 @@ def rows(
 
 
 def _trained(path: Path) -> tuple[Policy, Sequence[str], str]:
-    """Return the policy of a run, its settings, and what it was trained on."""
+    """Return the policy of a run, its settings, and its training scenes."""
     policy, config = load_policy(path), read(path).config
     sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
     known = config["method"].get("scenes", 0) or config["task"].get("randomize", {}).get("scenes", 0)

@@ -54,8 +54,7 @@ def main(argv: Sequence[str]) -> None:
 
     Words are those of plab run -m. RESULTS are folders, files, archives or a name such as example; words then
     choose among their runs, but for sim.device, sim.memory_mb, observe_particles and observe_target. The
-    actions are played in the hard contact model; minari.load_dataset finds what is written with
-    MINARI_DATASETS_PATH=datasets.
+    actions are replayed in the hard contact model; set MINARI_DATASETS_PATH=datasets for minari.load_dataset.
 
     EXAMPLES
       plab dataset task=Move

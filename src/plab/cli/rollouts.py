@@ -44,8 +44,7 @@ def render(argv: Sequence[str]) -> None:
     plab render --contact-sheet FILE [KEY=VALUE ...]     start and target of every task and variant
     plab render --film-strip FILE [KEY=VALUE ...]        frames of the best actions known for every task
 
-    Of folders and archives it takes the run with the highest score. The suffix of FILE decides what is
-    written:
+    Of folders and archives it takes the run with the highest score. The suffix of FILE selects the output:
       .png         start, target and the rollout's end, side by side
       .gif, .mp4   the rollout, with the target's ghost in it
 
@@ -188,9 +187,9 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
 def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     """Find the rollout, without simulating.
 
-    Adds ``result``, the result file or None, and ``config``, the configuration where there is none; and
-    ``output`` where it was not given: named like the result, with ``ending`` for ``.h5``, and beside it (but
-    not inside an archive), or like the task.
+    Adds ``result``, the result file or None, and ``config``, the configuration if there is no result; and a
+    default ``output``: beside the result (but not inside an archive) with the suffix ``ending``, or named
+    after the task.
 
     Returns:
         The output.

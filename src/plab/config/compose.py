@@ -1,8 +1,8 @@
 """Composition of a run's configuration from files and overrides, its checks, and its scene.
 
-``conf/*.yaml`` holds every number, the dataclasses beside this module say which keys there are. Hydra
-composes the files, optionally with a user's folder, and the overrides. :func:`finish` merges the chosen
-variant over the task and returns plain dataclasses, independent of Hydra and OmegaConf.
+``conf/*.yaml`` has all default values; the dataclasses in this package define the keys. Hydra composes the
+files, optionally with a user's folder, and the overrides. :func:`finish` merges the chosen variant over the
+task and returns plain dataclasses, independent of Hydra and OmegaConf.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
     Args:
         group: ``task``, ``method``, ``protocol``, ``sim`` or ``experiment``.
-        config_dir: Folder with files of the user's own, in subfolders named like the groups.
+        config_dir: Folder with the user's files, in subfolders named like the groups.
 
     Returns:
         Name to file, sorted by name.
@@ -94,7 +94,7 @@ def load_config(
 
     Args:
         overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
-        config_dir: Folder with files of the user's own, in subfolders named like the groups.
+        config_dir: Folder with the user's files, in subfolders named like the groups.
         alone: Whether there is no other run, on which an override about another variant, task or profile
             could have its effect.
 

@@ -3,11 +3,10 @@
 ``variant=random`` draws once, from the ranges in the task's section ``random``; samples depend only on the
 task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
 
-The section ``randomize``, from which every episode draws anew, is a part of the task's structure, as variants
-are, with a range ``[low, high]`` in place of each number or list of numbers:
-``{yield_stress: [50, 200], gravity: [[0, -33, 0], [0, -27, 0]]}``. Additional keys are ``offset`` of bodies
-and manipulators, ``yaw`` of bodies, and ``observation_noise``; ``scenes: 20`` selects one of 20 scenes of
-``variant=random``.
+The section ``randomize``, from which every episode is sampled, has the structure of the task, like variants,
+with a range ``[low, high]`` in place of each number or list of numbers: ``{yield_stress: [50, 200], gravity:
+[[0, -33, 0], [0, -27, 0]]}``. Additional keys are ``offset`` of bodies and manipulators, ``yaw`` of bodies,
+and ``observation_noise``; ``scenes: 20`` selects one of 20 scenes of ``variant=random``.
 """
 
 from __future__ import annotations
@@ -203,8 +202,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     """Sample the changes of a random variant, in the structure of the entries of ``variants``.
 
     Raises:
-        ConfigError: If the task, which has all its variants, does not say what to draw, or none of
-            :data:`ATTEMPTS` draws is valid.
+        ConfigError: If the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid.
         OmegaConfBaseException: If the task lacks a value or has one of the wrong type.
     """
     if not task.random:

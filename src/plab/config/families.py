@@ -1,8 +1,8 @@
 """Families of methods: types of their records, and the registry.
 
-A record is at the end of a runner's file, beside the dataclass of the section ``method``; a method's YAML
-names it as ``family: name`` of :data:`FAMILIES`, or as ``module:NAME`` outside plab: see docs/own_method.md.
-These files import large libraries only on use, so that looking up a record is fast.
+A record is at the end of a runner's file, after the dataclass of the section ``method``. A method's YAML
+refers to it by ``family``: a name of :data:`FAMILIES`, or ``module:NAME`` outside plab; see
+docs/own_method.md. These files import large libraries only on use, so that looking up a record is fast.
 """
 
 from __future__ import annotations

@@ -38,11 +38,11 @@ class BodyConfig(ranges.Section):
         particles: Number of particles before ``sim.particles_scale``.
         file: Mesh only: OBJ, STL or PLY file, y up. A relative path is searched for in the working directory,
             in the config folder and in its parent folder.
-        sha256: Mesh only: SHA-256 of the file. Found out where it is not given; refused if it is another one.
+        sha256: Mesh only: SHA-256 of the file. Default: computed; another checksum is rejected.
         youngs_modulus: Young's modulus E; default: the task's, as for the following keys.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
-        law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or ``module:NAME`` of your own;
+        law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or the ``module:NAME`` of a custom law;
             ``von_mises`` where it is not given.
         parameters: Other parameters of the law, by name; default: the law's.
     """
@@ -140,7 +140,7 @@ class KinematicsConfig(ranges.Section):
         together: Patterns of joints driven by one action component, by its name.
         omit: Patterns of collision geometry to leave out.
         friction: Coulomb friction of all links with the plasticine.
-        sha256: SHA-256 of the tree. Found out where it is not given; refused if it is another one.
+        sha256: SHA-256 of the tree. Default: computed; another checksum is rejected.
     """
 
     model: str
@@ -286,7 +286,7 @@ class TaskConfig(ranges.Section):
         kinematics: An articulated model; its links and actions follow those of the manipulators; None
             without.
         target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
-        variants: By name: what each variant changes: a part of this very structure, merged over it.
+        variants: Overrides of the task by variant, in the structure of the task.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
         randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.draws`; empty: no

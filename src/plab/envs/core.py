@@ -423,7 +423,7 @@ class EpisodeBatch:
 
         Raises:
             ValueError: If an option is invalid.
-            RuntimeError: If the environment is closed or its simulator's memory is gone.
+            RuntimeError: If the environment is closed or its simulator is invalid.
         """
         if self._simulator.changes != self._changes:
             # The caller has changed scenes, targets or initial states.
@@ -499,7 +499,7 @@ class EpisodeBatch:
             ValueError: If the shape is wrong or an action is not finite.
             gymnasium.error.ResetNeeded: If no episode has been started, or an episode has ended.
             plab.sim.SimulationError: If a simulation diverges and ``strict`` is True.
-            RuntimeError: If the environment is closed or its simulator's memory is gone.
+            RuntimeError: If the environment is closed or its simulator is invalid.
         """
         simulator, steps = self._simulator, self._taken(idle=idle)
         # The measures report divergence, too; checking here would wait for the device twice.
@@ -562,7 +562,7 @@ class EpisodeBatch:
         reproducible.
 
         Raises:
-            RuntimeError: If the environment is closed or its simulator's memory is gone.
+            RuntimeError: If the environment is closed or its simulator is invalid.
         """
         simulation = self._simulator.state()
         for e in self._failures:
@@ -591,7 +591,7 @@ class EpisodeBatch:
 
         Raises:
             ValueError: If a shape is wrong.
-            RuntimeError: If the environment is closed or its simulator's memory is gone.
+            RuntimeError: If the environment is closed or its simulator is invalid.
         """
         self._simulator.set_state(state.simulation)
         changed = self.draws.put(dict(enumerate(state.values)))

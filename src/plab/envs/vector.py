@@ -51,8 +51,8 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
             variant: Name of its variant.
             render_mode: ``rgb_array``, or None for no pictures.
             autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``NextStep`` resets in the
-                step after the end of an episode, which ignores the action; ``SameStep`` in the step that ends
-                it, whose last observation is in ``infos["final_obs"]``; ``Disabled`` requires
+                step after the end of an episode, which ignores the action; ``SameStep`` in the last step of
+                the episode, with the final observation in ``infos["final_obs"]``; ``Disabled`` requires
                 :meth:`reset` with ``options={"reset_mask": ...}``.
             **options: Arguments of :func:`plab.envs.core.make_batch` and
                 :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and

@@ -17,8 +17,8 @@ from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, ModelErro
 __all__ = ["locate_model", "read_model"]
 
 CAPSULE_RATIO = 1.5
-"""A mesh is fitted by a capsule if the shorter edges of its oriented bounding box have at most this ratio, by
-that box otherwise."""
+"""Largest ratio of the shorter edges of a mesh's oriented bounding box for fitting a capsule; otherwise the
+box is used."""
 
 # Quaternions from the frame of a shape about y to that of a geom about x, y or z.
 _ALONG = ((0.5**0.5, 0.0, 0.0, -(0.5**0.5)), (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.5**0.5, 0.0, 0.0))

@@ -364,7 +364,7 @@ class Floor:
         self._texture.SetInputData(image)
 
     def _lines(self, half: float) -> pv.PolyData:
-        """Return the lines, which are narrow rectangles of some half width."""
+        """Return the grid lines, as narrow rectangles with a given half width."""
         line = np.array([[-half, -half], [-half, 1 + half], [half, 1 + half], [half, -half]])
         along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
         both = np.concatenate([along, along[:, ::-1]])

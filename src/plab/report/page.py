@@ -134,7 +134,7 @@ class Page:
         content = self._content | {"configurations": configurations, "live": drawing or self._under_way}
         state = hashlib.sha256(json.dumps([content, str(self._values)]).encode()).hexdigest()[:16]
         text = json.dumps(content | {"state": state}, separators=(",", ":"), allow_nan=False)
-        # The only sign with which text could leave the script that it is in.
+        # The only character that could end the enclosing script.
         html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
         _write(self._out / "index.html", html)
         _write(self._out / "data" / "state.js", f"plab.state({json.dumps(state)});\n")
@@ -188,7 +188,7 @@ def _plural(count: int, what: str) -> str:
 
 
 def _sentence(runs: Runs) -> str:
-    """Return a sentence on the runs of the page."""
+    """Return a note on the runs of the page."""
     table = runs.table
     configurations = len(table[["task", "variant"]].drop_duplicates())
     tasks = sorted(set(table["task"]))

@@ -51,7 +51,7 @@ def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
         archive's path.
 
     Raises:
-        ResultsError: If there is nothing at ``source``.
+        ResultsError: If ``source`` does not exist.
     """
     for path, _ in run_files(Path(source)):
         for entry in read_each(path, _checked):

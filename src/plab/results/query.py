@@ -31,7 +31,7 @@ def connect(
         A connection; ``connection.sql("select ...").df()`` is a pandas table.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
+        ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     connection, unreadable = _connected(sources_of(source), iterations)
     warn_of(unreadable)
@@ -87,7 +87,7 @@ def scores(
 
     Raises:
         ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
-        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
+        ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]

@@ -138,7 +138,7 @@ def rows(
     Files are read in full first, so that their iterations and actions are known to be readable.
 
     Raises:
-        ResultsError: If there is nothing at ``source``.
+        ResultsError: If ``source`` does not exist.
     """
     entries = [entry for root in sources_of(source) for entry in _all_rows(root, index)]
     found = [entry for entry in entries if isinstance(entry, Row)]
@@ -149,7 +149,7 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
     """As :func:`rows`, but raise if files are requested and none can be read.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
+        ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     found, unreadable = rows(source)
     if unreadable and not found and not any(root.is_dir() for root in sources_of(source)):

@@ -312,8 +312,8 @@ class Agents:
         """Return Stable-Baselines3's policy with initial weights, on the CPU."""
 
     def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
-        """Return Stable-Baselines3's policy with an agent's networks, and by what its observations are
-        scaled, if they are."""
+        """Return Stable-Baselines3's policy with an agent's networks, and the scaling of its observations, if
+        any."""
         policy = first_policy(self.method, self._spaces)
         self.networks.write_to(policy, agent)
         return policy, None

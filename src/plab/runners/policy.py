@@ -221,7 +221,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
 
 def _policy(path: Path) -> Policy:
     arrays = read_arrays(path)
-    # NumPy's text may hold what is no character.
+    # NumPy's text may contain invalid characters.
     header = json.loads(str(arrays["header"][()]).encode())
     if header["format"] != _FORMAT:
         raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")

@@ -201,7 +201,7 @@ class RlRunner(PolicyRunner):
     training = Population
 
     def context(self) -> AbstractContextManager[Any]:
-        # The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
+        # The first layers, with 1,200 inputs and more, dominate the time of an update on a GPU.
         return torch_settings(self.method.torch_threads, tf32=self.method.torch_device == "cuda")
 
 

@@ -259,7 +259,7 @@ PROJECT = "plab"
 
 
 class RunLog:
-    """Log of a run beside its file, as ``logger`` says, opened at the first numbers.
+    """Log of a run beside its file, selected by ``logger`` and opened on first use.
 
     Each row is logged with the simulated environment steps as its step and the columns of results as names,
     the final evaluation with the prefix ``final/``.

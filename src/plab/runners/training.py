@@ -209,7 +209,7 @@ class Training(ABC):
 
     @abstractmethod
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
-        """Return a policy as Stable-Baselines3 has it, and by what its observations are scaled, if at all."""
+        """Return a policy as a Stable-Baselines3 policy, and the scaling of its observations, if any."""
 
 
 def whole_cycles(steps: int, cycle: int) -> int:

@@ -205,7 +205,7 @@ class Finalists:
         self.lowest = min(lowest, new, key=lambda one: one.loss)
 
     def keep_best(self) -> Finalist | None:
-        """Return the checked finalist that is better than what is kept, if any, and forget the highest."""
+        """Return the checked finalist if it is better than the kept actions, and reset the highest score."""
         best = None
         for one in (self.highest, self.lowest):
             better = not one.hard_score <= self.kept_score or (

@@ -109,7 +109,7 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
 
 
 def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
-    """Return a scene whose bodies have these values, by name and body."""
+    """Return a scene with these material values, by name and body."""
     shared: dict[str, Any] = {name: column[0] for name, column in values.items() if name in MATERIAL_KEYS}
     bodies = []
     for body, material, *numbers in zip(scene.bodies, scene.materials, *values.values(), strict=True):

@@ -264,7 +264,7 @@ class CameraSensor:
 
     @ti.kernel
     def _write_light(self, keys: Array, frame: Array, focal: ti.f32, out: Array):
-        """Light on manipulators and bodies, by the angle of their surface to a lamp beside the camera."""
+        """Shade manipulators and bodies by the angle of their surface to a light near the camera."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
             row, column = pixel // self.width, pixel % self.width

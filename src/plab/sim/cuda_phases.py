@@ -471,8 +471,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def set_frames(self, w, threads, poses: ti.template(), actions: ti.template(), t, before, after):
-        """Poses and frames of all substeps of environment step t, by the last of ``threads`` threads, whose
-        blocks have the fewest particles; all threads of a block take part."""
+        """Compute poses and frames of all substeps of environment step t in the last of ``threads`` threads,
+        whose blocks have the fewest particles; all threads of a block must take part."""
         at = w % RESIDENT_BLOCK
         first = ((threads - w + at) // RESIDENT_BLOCK - 1) * POSE_SHARE
         count = ti.min(self.pose_threads - first, POSE_SHARE)

@@ -161,7 +161,7 @@ class SumPhases(Storage):
 
     @ti.func
     def node_at(self, first, node):
-        """Address of a node of a grid that is scattered to, whose ``first`` number is at an address."""
+        """Return the address of a node of a scattered grid that begins at the address ``first``."""
         # In 64 bits: 32 count the nodes of many environments, but not their numbers.
         return first + ti.static(self.node_bytes) * ti.cast(node, ti.u64)
 

@@ -93,7 +93,8 @@ class ParticlePhases(Storage):
         return bitcode_function(path, symbol(part, name, TYPE_SUFFIXES[real] if real else precision))
 
     def scheduled(self, number: int) -> bool:
-        """Return True if a law has a schedule of its own, with singular values beyond its series' range."""
+        """Return True if a law has a special schedule, with singular values outside the range of its
+        series."""
         return self.laws[number] is LAWS["von_mises"]
 
     # -- access to the particle state ---------------------------------------------------------------

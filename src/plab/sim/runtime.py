@@ -116,7 +116,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
         raise ArgumentError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
-    # Threads that wait at barriers for others without a CPU can wait for good.
+    # Threads at barriers can wait indefinitely for threads without a CPU.
     wanted = 1 if device == "cuda" else max(1, min(threads or available_threads(), _cpus()))
     # Taichi's cache identifies kernels by the numbers of fields, so the count restarts when no simulator is
     # left.

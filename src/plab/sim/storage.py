@@ -188,7 +188,8 @@ class Storage:
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         if self.mixed:
-            # Each particle's coefficients and, of several laws, the number of its own; and that of its body.
+            # Coefficients of each particle and, with several laws, the number of its law; and the number of
+            # its body.
             shape = b * self.tiles * self.place_rows
             self.place_material = self.share(ti.Vector.field(self.lanes, real, shape=shape))
             self.place_body = self.share(ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles))
@@ -218,8 +219,8 @@ class Storage:
         self.block_count = ti.field(ti.i32, shape=b)
         self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
         self.fault = self.share(ti.field(ti.i32, shape=b))
-        # Whether a moving manipulator has touched the body since the reset, and the last environment step at
-        # whose start none had.
+        # Whether a moving manipulator has made contact since the reset, and the last environment step that
+        # started without contact.
         self.touched = self.share(ti.field(ti.i32, shape=b))
         self.untouched_step = self.share(ti.field(ti.i32, shape=b))
 
@@ -327,7 +328,7 @@ class Storage:
         return field
 
     def write(self, field: ti.Field, values: ArrayLike) -> None:
-        """Write all entries of a shared field, from numbers whose shape begins with the field's."""
+        """Write all entries of a shared field, from numbers with the field's leading shape."""
         self._copy_field(field, np.asarray(values).reshape(-1), 1)
 
     def read(self, field: ti.Field) -> np.ndarray:

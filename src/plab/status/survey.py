@@ -45,9 +45,9 @@ class Run:
         score: Score of a finished run, or of the best row so far; None if there is none.
         done: Iterations, or episodes, done.
         total: Total number of iterations or episodes; 0 if unknown.
-        rate: Iterations or episodes per second of a run in progress [1/s]; None if it is not known.
+        rate: Iterations or episodes per second of a run in progress [1/s]; None if unknown.
         seconds: Wall time so far [s].
-        left: Remaining time [s], or its share of a batch; None if it is not known.
+        left: Remaining time [s], or its share of a batch; None if unknown.
         together: Number of runs in its process, if in progress.
         path: Its file; empty for a missing run.
     """
@@ -85,7 +85,7 @@ class Group:
         score: Mean score of finished runs; None if none is.
         mean_seconds: Mean wall time of finished runs [s]; None if none is.
         rate: Mean rate of running runs [1/s]; None if none is.
-        left: Remaining time with one worker [s]; None if it is not known.
+        left: Remaining time with one worker [s]; None if unknown.
     """
 
     task: str
@@ -118,7 +118,7 @@ class Survey:
 
     @property
     def running(self) -> list[Run]:
-        """Runs under way."""
+        """Runs in progress."""
         return [run for run in self.runs if run.state == "running"]
 
     @property
@@ -128,8 +128,8 @@ class Survey:
 
     @property
     def eta(self) -> float | None:
-        """Remaining time until all runs are finished [s], with the current number of processes; None if it is
-        not known."""
+        """Remaining time until all runs are finished [s], with the current number of processes; None if
+        unknown."""
         lefts = [group.left for group in self.groups]
         if not self.workers or None in lefts:
             return None

@@ -125,7 +125,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
 
     Raises:
         SubmissionError: If there is no such folder.
-        plab.config.ConfigError: If an override does not fit.
+        plab.config.ConfigError: If an override is invalid.
     """
     if not folder.is_dir():
         raise SubmissionError(f"there is no folder {folder}")
@@ -182,7 +182,7 @@ def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point
     )
 
 
-# ------------------------------------------------------------------------------------------------- handed in
+# ------------------------------------------------------------------------------------------------ submissions
 
 
 @functools.cache

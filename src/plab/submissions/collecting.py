@@ -94,7 +94,7 @@ def from_policies(
 
     Raises:
         SubmissionError: If a policy cannot be read or run, or the simulation diverges.
-        plab.config.ConfigError: If an override does not fit.
+        plab.config.ConfigError: If an override is invalid.
     """
     entries: list[Entry] = []
     files: dict[str, bytes] = {}

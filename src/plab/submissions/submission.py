@@ -106,7 +106,7 @@ class Configuration:
         ``targets.source``.
 
         Raises:
-            plab.config.ConfigError: If an override does not fit.
+            plab.config.ConfigError: If an override is invalid.
             SubmissionError: If the authors' targets are needed, and not given.
         """
         # The folder of the authors' files applies only to their targets.

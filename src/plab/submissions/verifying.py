@@ -106,7 +106,7 @@ def verify(
     Raises:
         SubmissionError: If its physics, scenes or targets differ, or its plans or policies do not fit their
             tasks.
-        plab.config.ConfigError: If an override does not fit.
+        plab.config.ConfigError: If an override is invalid.
     """
     given = tuple(overrides)
     cfgs = _configs(submission, given)

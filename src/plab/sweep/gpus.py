@@ -26,10 +26,10 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 class _Worker:
-    """A process on a GPU, started anew if the last one was killed.
+    """A process on a GPU, restarted if killed.
 
     Attributes:
-        kind: Kind of its last batch, whose simulator it still has.
+        kind: Kind of its last batch, which determines its cached simulator.
     """
 
     def __init__(self, gpu: str) -> None:

@@ -190,7 +190,7 @@ class PointsTarget(PointsRecipe):
     Attributes:
         file: NumPy array of shape [point, 3], PLY file (its vertices), or XYZ file. A relative one is looked
             for in the working directory, in the config folder and in the folder above it.
-        sha256: SHA-256 of the file. Found out where it is not given; refused if it is another one.
+        sha256: SHA-256 of the file. Default: computed; another checksum is rejected.
         fill: Fill the space that the points enclose.
     """
 
@@ -199,7 +199,7 @@ class PointsTarget(PointsRecipe):
     fill: bool = False
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        # Imported here: SciPy's start-up would be paid by every `--help`.
+        # Imported here, because SciPy would slow down every `--help`.
         from scipy.spatial import KDTree
 
         try:
@@ -229,7 +229,7 @@ class PointsTarget(PointsRecipe):
 def _filled(points: np.ndarray, n: int) -> tuple[np.ndarray, float]:
     """Return the cells that contain points or are enclosed by them, bool, shape [n, n, n], and the fraction
     of hollow cells."""
-    # Imported here: SciPy's start-up would be paid by every `--help`.
+    # Imported here, because SciPy would slow down every `--help`.
     from scipy.ndimage import binary_closing, binary_dilation, binary_fill_holes
 
     cells = np.zeros((n, n, n), bool)

@@ -56,8 +56,8 @@ def show(
         what: A result file, to replay its best actions; or a configuration.
         actions: Actions in [-1, 1] for the configuration, shape [T, A]; default: the best known actions for
             its task, or zeros.
-        every: Environment steps between frames, interpolated by the viewer; None: so many that there are no
-            more than 60 frames.
+        every: Environment steps between frames, interpolated by the viewer; default: at most 60
+            frames.
         surface: Show plasticine as smooth surfaces instead of its particles.
         height: Height of the viewer [pixels].
 

@@ -52,8 +52,8 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
 
     Args:
         recording: The rollout.
-        every: Environment steps between frames, with interpolated particles; None: so many that there are no
-            more than 60 frames.
+        every: Environment steps between frames, with interpolated particles; default: at most 60
+            frames.
         surface: Show plasticine as smooth surfaces instead of its particles.
 
     Returns:
@@ -203,7 +203,7 @@ def _with_bar(
     title = f"{recording.task}, variant {recording.variant}"
     bar = _template("bar.html").render(
         title=title,
-        # The only sign with which text could leave the script that it is in.
+        # The only character that could end the enclosing script.
         content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
         faded=[group for group in ("plasticine", "manipulators", "target") if group in groups],
     )

@@ -1,10 +1,10 @@
 """Search algorithms of the planners.
 
 * ``multistart``: gradient descent (Adam) from many starts; the worse half is replaced at intervals. *
-``cem``, the cross-entropy method: draw curves from a normal distribution, fit it to the best, again. *
-``mppi``, model-predictive path integral: the mean of all curves, weighted by exp(-cost), again and again;
-  over the whole episode: the simulator is deterministic, so that planning anew on the way would gain nothing.
-* ``cmaes``, covariance matrix adaptation of a curve's points, by the library cmaes.
+``cem``, the cross-entropy method: sample curves from a normal distribution, fit it to the best, repeat. *
+``mppi``, model-predictive path integral: the repeated mean of all curves, weighted by exp(-cost), over the
+whole episode; with a deterministic simulator, replanning during the episode would gain nothing. * ``cmaes``,
+covariance matrix adaptation of a curve's points, by the library cmaes.
 
 The last three draw curves of actions and learn from their costs, without a gradient. To reproduce a result:
 

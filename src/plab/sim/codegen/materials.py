@@ -1,8 +1,8 @@
 """Material updates and their adjoints, for a tile of particles on the CPU and for one particle on CUDA.
 
 Any law is an update from C and F to A and the new F, and its adjoint, traced. von Mises plasticity has a
-schedule of its own, in parts: tiles without yielding particles skip plastic flow, the adjoint reuses the
-strain of the forward part, and strains outside the range of the series use singular values.
+special schedule with several parts: tiles without yielding particles skip plastic flow, the adjoint reuses
+the strain of the forward part, and strains outside the range of the series use singular values.
 
 Adjoints have the suffix ``_bar``.
 """
@@ -225,7 +225,7 @@ class Tile:
 
 
 def tile_strain(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Strain of a tile whose state is at ``source``: G, d, J and c2 to ``strains``."""
+    """Strain of a tile with its state at ``source``: G, d, J and c2 to ``strains``."""
     tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served", mixed)
     _c, g, j, (c2, _w, _z, _z2, _a1, _a2, d) = tile.strain()
     tile.leave(0, g)
@@ -393,8 +393,8 @@ class Particle:
         numbers: str = "",
         grids: str = "",
     ) -> None:
-        """Begin a function of addresses in grids, and their nodes per axis, of vectors, named with their
-        lengths as ``c9``, and of numbers."""
+        """Begin a function of grid addresses and nodes per axis, vectors (named with their lengths, such as
+        ``c9``), and numbers."""
         self.lengths = {one[0]: int(one[1:]) for one in vectors.split()}
         names = [f"{one}{k}" for one, length in self.lengths.items() for k in range(length)]
         self.code = Scalars(module, name, real, grids, " ".join([*names, numbers]), grid=bool(grids))
