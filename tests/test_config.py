@@ -91,13 +91,6 @@ def test_a_variant_may_change_anything_and_add_bodies():
     assert [body.particles for body in scene.bodies] == [20, 10]
 
 
-def test_particles_scale():
-    def count(scale: float) -> int:
-        return build_scene(load_config([f"sim.particles_scale={scale}"])).particle_count
-
-    assert (count(0.1), count(1), count(2.5), count(5e-5)) == (1000, 10000, 25000, 1)
-
-
 def test_a_tilde_is_the_home(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     cfg = load_config(["results_dir=~/my results", "targets.source=~/files"])

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.config import Config, ConfigError, build_scene
+from plab.config import Config, ConfigError, build_scene, drawn_configs
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     import torch
 
     from plab.scenes import Scene
+
+FIRST_SCENE = 1000
+"""``seed_scene`` of the first random scene of ``method.scenes`` and of ``task.randomize.scenes``."""
 
 _log = logging.getLogger(__name__)
 
@@ -106,6 +109,13 @@ def fits(cfg: Config) -> bool:
     except (SceneError, TargetError):
         return False
     return True
+
+
+def drawn_scenes(cfg: Config, numbers: Iterable[int]) -> list[Config]:
+    """Return configurations of a task's random scenes, those that fit the grid; all if none does, as building
+    them raises their errors."""
+    drawn = drawn_configs(cfg, [FIRST_SCENE + number for number in numbers])
+    return [one for one in drawn if fits(one)] or drawn
 
 
 def make_simulator(

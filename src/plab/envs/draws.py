@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from plab.config import Config, ConfigError, build_scene, drawn_configs
+from plab.config import Config, ConfigError, build_scene
 from plab.config.draws import (
     NOISE,
     SCENE,
@@ -28,14 +28,11 @@ from plab.config.draws import (
     yaws,
 )
 from plab.errors import ArgumentError
-from plab.problem import Problem, fits, make_targets, target_distance
+from plab.problem import Problem, drawn_scenes, make_targets, target_distance
 from plab.scenes import Scene, SceneError, sample_particles
 from plab.sim import Simulator
 from plab.targets import RECIPES, TargetError, build_target
 from plab.targets.recipes import TensorRecipe
-
-FIRST_SCENE = 1000
-"""``seed_scene`` of the first scene of ``task.randomize.scenes``."""
 
 Target = tuple[np.ndarray, np.ndarray]
 """Mass tensor of a target, and the distance to it."""
@@ -229,10 +226,7 @@ def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np
 
 def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
     """Build the random scenes and targets of a configuration's episodes."""
-    count = int(cfg.task.randomize[SCENES])
-    drawn = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
-    # Errors of these scenes are raised when they are built.
-    drawn = [one for one in drawn if fits(one)] or drawn
+    drawn = drawn_scenes(cfg, range(int(cfg.task.randomize[SCENES])))
     pool: list[_Base] = []
     own, size = simulator.scenes, simulator.batch
     for first in range(0, len(drawn), size):

@@ -33,9 +33,6 @@ DEVIATION_MIN = 0.01
 """Least standard deviation for scaling observations [domain units, domain units / s]. Otherwise nearly
 constant entries, scaled up, would dominate the gradient through the policy."""
 
-FIRST_SCENE = 1000
-"""``seed_scene`` of the first scene of ``method.scenes``."""
-
 
 @dataclass
 class ActorConfig(PolicyConfig):
@@ -208,14 +205,10 @@ class ActorRunner(PolicyRunner):
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:
     """Return the configurations of ``count`` training environments in a round: the run's own, or the next
     random scenes that fit into the grid, repeated if there are fewer."""
-    from plab.config import drawn_configs
-    from plab.problem import fits
+    from plab.problem import drawn_scenes
 
     scenes = [cfg]
     if method.scenes:
         some = min(method.scenes, count)
-        seeds = [FIRST_SCENE + (turn * some + k) % method.scenes for k in range(some)]
-        drawn = drawn_configs(cfg, seeds)
-        # Errors of these scenes are raised when they are built.
-        scenes = [one for one in drawn if fits(one)] or drawn
+        scenes = drawn_scenes(cfg, [(turn * some + k) % method.scenes for k in range(some)])
     return [scenes[k % len(scenes)] for k in range(count)]
