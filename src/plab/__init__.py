@@ -39,7 +39,7 @@ __all__ = [
     "make_vec",
 ]
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 TASKS = tuple(suite_tasks())
 """Names of the suite's tasks."""

@@ -90,7 +90,7 @@ def load_object(text: str, kind: type[Kind]) -> Kind:
         raise ConfigError(f"'{text}': {module.__file__} has no {name}")
     found = getattr(module, name)
     if not isinstance(found, kind):
-        raise ConfigError(f"'{text}' has to be a {kind.__name__}, and is a {type(found).__name__}")
+        raise ConfigError(f"'{text}' must be a {kind.__name__}, not a {type(found).__name__}")
     return found
 
 

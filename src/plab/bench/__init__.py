@@ -18,7 +18,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the benchmark that the first argument names; return its exit code."""
     name, *rest = list(argv) or ["--help"]
     if name in ("-h", "--help"):
-        print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has a --help of its own")
+        print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has its own --help")
         return 0
     if name not in BENCHMARKS:
         raise ArgumentError(f"unknown benchmark {name}; {pick(name, BENCHMARKS)}")

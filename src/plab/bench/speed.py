@@ -132,7 +132,7 @@ def main(argv: Sequence[str]) -> int:
     parser = Parser("plab bench speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
-    parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
+    parser.add_argument("--precision", nargs="+", help="precisions, measured in sequence")
     parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
     parser.add_argument("--steps", type=positive, help="environment steps per rollout")
     parser.add_argument("--repeats", type=positive, help="timed rollouts")

@@ -235,7 +235,7 @@ def options_of(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
     parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
     parser.add_argument("--horizon", type=positive, help="environment steps of the long horizon (1000)")
-    parser.add_argument("--family", nargs="+", help="only these families of cases")
+    parser.add_argument("--family", nargs="+", help="families of cases")
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     options = parser.parse_intermixed_args(argv)
     plan = QUICK if options.quick else FULL

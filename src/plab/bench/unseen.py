@@ -117,9 +117,11 @@ def main(argv: Sequence[str]) -> None:
     parser = Parser("plab bench unseen", main.__doc__)
     parser.add_argument("what", nargs="+", metavar="RESULT | KEY=VALUE", help="keys are those of plab run")
     parser.add_argument("--policy", metavar="MODULE:NAME", help="a function from observations to actions")
-    parser.add_argument("--observe", default="state", metavar="NAME,...", help="what --policy observes")
+    parser.add_argument("--observe", default="state", metavar="NAME,...", help="observations of --policy")
     parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="number of scenes")
-    parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
+    parser.add_argument(
+        "--together", type=positive, default=25, metavar="N", help="number of scenes simulated together"
+    )
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
     paths, words = sources_and_words(options.what, default=None)

@@ -70,10 +70,10 @@ def main(argv: Sequence[str]) -> None:
     add("--observe", default="state", metavar="NAME,...", help="state (default), particles, depth, rgb, ...")
     what = "cameras by name: YAML with position, target, size, ..."
     add("--cameras", type=folder, metavar="FILE", help=what)
-    add("--min-score", type=float, default=0.0, metavar="S", help="leave out episodes that score less")
+    add("--min-score", type=float, default=0.0, metavar="S", help="skip episodes with a lower score")
     what = "scenes simulated at a time, 25 by default"
     add("--together", type=positive, default=25, metavar="N", help=what)
-    add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for plab run")
+    add("--config-dir", metavar="FOLDER", help="folder with your own tasks, as for plab run")
     options = parser.parse_intermixed_args(argv)
     output = options.output or Path(os.environ.get("MINARI_DATASETS_PATH") or "datasets")
     cameras = None if options.cameras is None else _cameras(options.cameras)

@@ -13,7 +13,7 @@ plab targets                              targets of tasks
 plab submit, verify, leaderboard          results to publish, and tables of them
 plab bench speed                          benchmarks of speed, accuracy, stability, policies
 
-Each has a --help of its own.
+Each has its own --help.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser("plab report", __doc__)
-    parser.add_argument("what", choices=list(_MAKERS), help="what to make")
+    parser.add_argument("what", choices=list(_MAKERS), help="kind of report")
     add_sources(parser, "runs to take, e.g. task=Rope,Move seed=0,1,2")
     parser.add_argument("--out", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by plab bench speed --paper --csv, for the table of times"

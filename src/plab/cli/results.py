@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int | None:
         Exit code: 0, 1 if ``check`` found a fault, 2 for invalid input.
     """
     parser = Parser("plab results", __doc__)
-    parser.add_argument("command", choices=_COMMANDS, help="what to do; it has a --help of its own")
+    parser.add_argument("command", choices=_COMMANDS, help="subcommand; each has its own --help")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
     # Without subparsers, which do not support positional arguments on both sides of an option.
@@ -56,8 +56,8 @@ def _scores(argv: Sequence[str]) -> None:
     add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default those finished")
     what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
     parser.add_argument("--keys", type=_names, default=[], help=what)
-    parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
-    parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
+    parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, separated by commas")
+    parser.add_argument("--descending", action="store_true", help="sort in descending order")
     add_forms(parser)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)

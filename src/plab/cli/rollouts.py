@@ -36,13 +36,13 @@ _MAX_FRAME_SIZE = 4096
 
 @command_line
 def render(argv: Sequence[str]) -> None:
-    """Draw a run's best actions, the best actions known for a task, or all tasks.
+    """Draw a run's best actions, the best known actions for a task, or all tasks.
 
     plab render RESULT_FILE [--output FILE]
     plab render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
     plab render KEY=VALUE ... [--output FILE]
     plab render --contact-sheet FILE [KEY=VALUE ...]     start and target of every task and variant
-    plab render --film-strip FILE [KEY=VALUE ...]        frames of the best actions known for every task
+    plab render --film-strip FILE [KEY=VALUE ...]        frames of the best known actions for every task
 
     Of folders and archives it takes the run with the highest score. The suffix of FILE selects the output:
       .png         start, target and the rollout's end, side by side
@@ -55,17 +55,22 @@ def render(argv: Sequence[str]) -> None:
     """
     parser = _parser("plab render", render.__doc__, "a film")
     add = parser.add_argument
-    add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
+    add(
+        "--output",
+        type=folder,
+        metavar="FILE",
+        help="output file (default: a .png named after the result or the task)",
+    )
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
     add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
-    add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
+    add("--size", type=_size, metavar="WxH", help="size of a frame or cell in pixels (default: 480x360)")
     options = parser.parse_intermixed_args(argv)
     if options.contact_sheet and options.film_strip:
         parser.error("give either --contact-sheet or --film-strip")
     if path := options.contact_sheet or options.film_strip:
         suffix = ".png" if options.contact_sheet else ".jpg"
         if path.suffix.lower() != suffix:
-            raise RenderError(f"cannot write {path}: it has to be a {suffix}")
+            raise RenderError(f"cannot write {path}: it must be a {suffix}")
         own = ("task=", "variant=") if options.contact_sheet else ("task=",)
         _refuse_choice(options, own)
     else:
@@ -90,7 +95,7 @@ def render(argv: Sequence[str]) -> None:
 
 @command_line
 def view(argv: Sequence[str]) -> None:
-    """Write a page on which a run's best actions, or the best actions known for a task, are played in 3-D.
+    """Write a page on which a run's best actions, or the best known actions for a task, are played in 3-D.
 
     plab view RESULT_FILE [--output FILE.html]
     plab view KEY=VALUE ... [--output FILE.html]
@@ -106,7 +111,9 @@ def view(argv: Sequence[str]) -> None:
     parser = _parser("plab view", view.__doc__, "the page")
     what = "by default a .html named like the result or the task; of --gallery a folder, gallery by default"
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
-    parser.add_argument("--gallery", action="store_true", help="the best actions known for every task")
+    parser.add_argument(
+        "--gallery", action="store_true", help="frames of the best known actions of every task"
+    )
     what = "show plasticine as smooth surfaces instead of its particles"
     parser.add_argument("--surface", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -139,7 +146,7 @@ def view(argv: Sequence[str]) -> None:
 
 @command_line
 def export(argv: Sequence[str]) -> None:
-    """Write a run's best actions, or the best actions known for a task, for ParaView or Blender.
+    """Write a run's best actions, or the best known actions for a task, for ParaView or Blender.
 
     plab export RESULT_FILE [--format vtk|ply] [--output FOLDER]
     plab export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
@@ -154,7 +161,9 @@ def export(argv: Sequence[str]) -> None:
       plab export task=Torus variant=2 --format ply --output torus
     """
     parser = _parser("plab export", export.__doc__, "the series")
-    parser.add_argument("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
+    parser.add_argument(
+        "--format", choices=("vtk", "ply"), default="vtk", help="format of the files (default: vtk)"
+    )
     what = "by default named like the result or the task"
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -180,7 +189,7 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
     add = parser.add_argument
     add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of plab run")
     add("--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps")
-    add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for plab run")
+    add("--config-dir", metavar="FOLDER", help="folder with your own tasks, as for plab run")
     return parser
 
 
@@ -219,7 +228,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         check_sources(cfg)
         usual = Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
     else:
-        raise RenderError("say what to show: a result file, or a task such as task=Torus; --help explains")
+        raise RenderError("nothing to show: give a result file, or a task such as task=Torus; see --help")
     options.output = options.output or usual
     return options.output
 

@@ -55,7 +55,7 @@ def submit(argv: Sequence[str]) -> None:
     add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
     add("--policy", type=_policy, action="append", default=[], help=what)
-    add("--steps", type=seed, help="with --policy: environment steps that the training of each took")
+    add("--steps", type=seed, help="with --policy: environment steps in the training of each policy")
     what = f"with --policy: act in the {len(UNSEEN)} unseen configurations of the task, too"
     add("--unseen", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -110,7 +110,7 @@ def verify(argv: Sequence[str]) -> int:
     parser.add_argument("arguments", nargs="+", help=what)
     what = "run the policies in the files: programs of other people, so do it where they can do no harm"
     parser.add_argument("--run-policies", action="store_true", help=what)
-    parser.add_argument("--float32", action="store_true", help="leave float64 out")
+    parser.add_argument("--float32", action="store_true", help="simulate in float32 only")
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.arguments, default=None)
     if not sources:

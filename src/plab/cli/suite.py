@@ -27,7 +27,7 @@ def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
     """Add the shared arguments, and parse."""
     add = parser.add_argument
     add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
-    add("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+    add("--task", type=task_list, default=suite_tasks(), help="only these tasks, such as Torus,Rope")
     options = parser.parse_intermixed_args(argv)
     if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
         parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
@@ -112,8 +112,8 @@ def targets(argv: Sequence[str]) -> None:
     targets of the original release.
     """
     parser = Parser("plab targets", targets.__doc__)
-    parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
-    parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
+    parser.add_argument("--rebuild", action="store_true", help="simulate also cached targets")
+    parser.add_argument("--csv", type=to_write, help="also write the table to this file")
     options = _options(parser, argv)
     if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
         parser.error("--rebuild has no effect with targets.source: leave one of them out")

@@ -136,7 +136,7 @@ def simulate(
             ``full_gradient=True``.
     """
     if unknown := set(initial) - set(_FIELDS):
-        raise TypeError(f"'{min(unknown)}' is no part of a state: {', '.join(_FIELDS)}")
+        raise TypeError(f"'{min(unknown)}' is not a part of a state: {', '.join(_FIELDS)}")
     parts = [floating(actions, simulator), material, *(initial.get(name) for name in _FIELDS)]
     gradient = torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in parts)
     return States(*_States.apply(simulator, every_step, mass, gradient, *parts))

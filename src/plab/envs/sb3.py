@@ -38,7 +38,7 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
     spec = gymnasium.spec(env_id)
     if spec.entry_point != ENTRY_POINT:
         raise ArgumentError(
-            f"'{env_id}' is no environment of plab's: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
+            f"'{env_id}' is not an environment of plab: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
     batch = make_batch(num_envs=num_envs, **spec.kwargs | options)
     return PlabVecEnv(batch, render_mode=render_mode, spec=spec)

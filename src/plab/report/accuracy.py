@@ -77,7 +77,7 @@ def _diagram(name: str, table: pd.DataFrame, panels: Sequence[tuple[str, str, st
         log_axis(panel, "ms per step with gradient" if timed else numbers)
         log_axis(panel, _ERRORS[column], vertical=True)
     legend(figure)
-    marks = f"numbers: {numbers}; x above: broke off"
+    marks = f"numbers: {numbers}; x above: diverged"
     figure.supxlabel(marks, fontsize=6, x=0.99, ha="right")
     notes = [
         f"Error against a much finer reference in float64; {marks}.",

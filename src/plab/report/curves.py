@@ -224,7 +224,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
         known = demonstration_scores().groupby("task")["score"].mean()
         best = [known.get(task, np.nan) for task in tasks]
         line: dict[str, Any] = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
-        panel.scatter(range(len(tasks)), best, label="best actions known", **line)
+        panel.scatter(range(len(tasks)), best, label="best known actions", **line)
         notes.append("Black: mean over the variants of what the reference demonstrations reach.")
     panel.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
     panel.set(ylim=(0.0, 1.08), ylabel="normalised incremental IoU")

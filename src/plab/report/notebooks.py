@@ -92,7 +92,7 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
         # Output of the kernel process concerns Jupyter; output of cells is in the notebook.
         client.execute(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except CellExecutionError as error:
-        raise ResultsError(f"notebook {name} broke off: {error.ename}: {error.evalue}") from error
+        raise ResultsError(f"notebook {name} failed: {error.ename}: {error.evalue}") from error
     for cell in notebook.cells:
         if cell.cell_type == "code":
             # Results are displayed explicitly; printed text comes from libraries.

@@ -301,7 +301,7 @@ def in_all(cells: pd.DataFrame) -> dict[str, float]:
 
 # ------------------------------------------------------------------------------------------------ solvability
 
-_DEMONSTRATIONS = "Normalised incremental IoU of the best actions known, replayed in the hard contact model."
+_DEMONSTRATIONS = "Normalised incremental IoU of the best known actions, replayed in the hard contact model."
 
 
 def solvability(runs: Runs) -> list[Table]:

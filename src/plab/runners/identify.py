@@ -101,7 +101,7 @@ class IdentifyRunner(Runner):
         """Start from the configuration's parameters, or resume from the file."""
         first = [_value(self.problem.scenes[0], name) for name in self.method.parameters]
         if min(first) <= 0.0:
-            raise ConfigError("parameters that are fitted must be positive at first")
+            raise ConfigError("fitted parameters must be positive initially")
         logs = np.log(first)
         nothing = np.zeros((len(logs), len(logs))), np.zeros(len(logs))
         begin = {"trial": logs, "best": logs, "cost": np.inf, "damping": self.method.damping}

@@ -256,5 +256,7 @@ def _method(section: Any, path: Path) -> PolicyConfig:
     except ConfigError as error:
         raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
-        raise ValueError(f"its method is none: {(error.msg or str(error)).splitlines()[0]}") from error
+        raise ValueError(
+            f"its section method is invalid: {(error.msg or str(error)).splitlines()[0]}"
+        ) from error
     return cast(PolicyConfig, method)

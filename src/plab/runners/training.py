@@ -355,7 +355,7 @@ def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
     if not np.isfinite(done.actions).all():
         return NOT_FINITE
     if broken and len(broken) >= learned.ended:
-        return f"all {learned.ended} episodes of training broke off, the first in {broken[0]}"
+        return f"all {learned.ended} training episodes diverged, the first in {broken[0]}"
     if done.failure and track.best_actions is None:
         return done.failure
     provenance = track.run.result.provenance
@@ -363,7 +363,7 @@ def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
         if texts:
             provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
             _log.warning(
-                "%s: iteration %d: %d %s broke off and rested until their end, the first in %s",
+                "%s: iteration %d: %d %s diverged and were frozen until their end, the first in %s",
                 *(track.run.path, track.iteration, len(texts), name, texts[0]),
             )
     return ""

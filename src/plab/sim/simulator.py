@@ -796,7 +796,7 @@ class Simulator:
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
             raise RuntimeError(
-                "this simulator's memory is gone: Taichi was started anew with another device, precision or "
+                "this simulator is invalid: Taichi was restarted with another device, precision or "
                 "number of threads; build the simulator again"
             )
 

@@ -308,11 +308,12 @@ class RecordedStates:
         for name, bar in given.items():
             shape = np.shape(getattr(self, name)) if getattr(self, name) is not None else None
             if bar is not None and np.shape(bar) != shape:
-                raise ArgumentError(f"derivatives by {name} have shape {np.shape(bar)}, not {shape}")
+                raise ArgumentError(
+                    f"derivatives with respect to {name} have shape {np.shape(bar)}, not {shape}"
+                )
         if not self._is_current():
             raise RuntimeError(
-                "the way back is gone: record with gradient=True, and pull back before the simulator runs "
-                "again"
+                "there is no gradient: record with gradient=True, and pull back before it runs again"
             )
         self._bars = {name: self._by_step(bar) for name, bar in given.items() if bar is not None}
         return self._back()
@@ -428,7 +429,7 @@ class ClosedLoop:
         expected = engine.batch, -(-engine.particles // stride), 6
         if tuple(moved.shape) != expected or tuple(posed.shape) != (engine.batch, engine.manipulators, 8):
             raise ArgumentError(
-                f"derivatives by the observation have shapes {tuple(moved.shape)} and "
+                f"derivatives with respect to the observation have shapes {tuple(moved.shape)} and "
                 f"{tuple(posed.shape)}, not {expected} and {(engine.batch, engine.manipulators, 8)}"
             )
         for first in (0, AT_V):

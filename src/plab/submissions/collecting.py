@@ -109,6 +109,6 @@ def from_policies(
         for cfg, one in zip(cfgs, played, strict=True):
             configuration = configuration_of(cfg)
             if one.failure:
-                raise SubmissionError(f"{configuration.name}: the simulation broke off, {one.failure}")
+                raise SubmissionError(f"{configuration.name}: the simulation diverged, {one.failure}")
             entries.append(Entry(configuration, Checksums.of(cfg), steps, one.score, policy=name))
     return entries, files

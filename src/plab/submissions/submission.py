@@ -357,7 +357,7 @@ def read(path: str | Path) -> Submission:
         about = json.loads(members.get(_MANIFEST, b"null"))
         listed = about.pop("entries", None) if isinstance(about, dict) else None
         if not isinstance(listed, list):
-            raise UnreadableError(f"it is no submission: it has no {_MANIFEST} with entries")
+            raise UnreadableError(f"it is not a submission: it has no {_MANIFEST} with entries")
         _check(about, _MANIFEST_RULES, _MANIFEST)
         if about["format"] != FORMAT:
             layout = f"layout {about['format']}, this plab ({plab.__version__}) reads {FORMAT}"

@@ -156,7 +156,7 @@ def _verdict(entry: Entry, played: Mapping[str, ReplayedScore]) -> Verdict:
         return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
     scores = {precision: one.score for precision, one in played.items()}
     if broken := [f"{precision}: {one.failure}" for precision, one in played.items() if one.failure]:
-        return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation broke off, {broken[0]}")
+        return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation diverged, {broken[0]}")
     if min(abs(score - entry.score) for score in scores.values()) <= TOLERANCE:
         return Verdict(entry, scores, HOLDS)
     reached = ", ".join(f"{score:.4f} in {precision}" for precision, score in scores.items())
