@@ -13,8 +13,7 @@
 # %% [markdown]
 # # Accuracy
 #
-# How far results are from those of much finer simulations, what single precision changes, and what the
-# contact model changes.
+# Errors relative to much finer simulations, and the effects of single precision and of the contact model.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -58,8 +57,8 @@ if table is not None:
 # %% [markdown]
 # ## Soft and hard contact
 #
-# Gradient methods find their actions in the contact model of their rollouts (soft, but for Adam-H) and are
-# judged in the hard one. Below the line: what was won in the one is lost in the other.
+# Gradient methods optimise actions in the contact model of their rollouts (soft, except for Adam-H) and are
+# evaluated in the hard one. Points below the line lose score in hard contact.
 
 
 # %%

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Anatomy of a run
 #
-# One result file: what was run, what happened, what came out. It is the run with the highest score, unless
-# one is named.
+# One result file in detail: configuration, iterations and evaluation, by default of the run with the highest
+# score.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -49,7 +49,7 @@ if run is not None:
     say(f"Made by `{COMMAND}` from `{run.path}`; SHA-256 of its configuration `{run.config_hash}`.")
 
 # %% [markdown]
-# ## What was run
+# ## Configuration
 
 # %%
 if run is not None:
@@ -72,7 +72,7 @@ if run is not None:
 # ## Loss
 
 # %%
-# Okabe and Ito's colours, which people with any colour vision can tell apart.
+# Okabe and Ito's palette, suitable for all types of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 
@@ -167,7 +167,7 @@ if run is not None and run.best_actions is not None:
     show_figure(drawing)
 
 # %% [markdown]
-# ## What they do
+# ## Effect of the actions
 
 # %%
 if run is not None and run.best_actions is not None:

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Reproduction
 #
-# plab's scores beside those that Huang et al. print (PlasticineLab, ICLR 2021): normalised incremental IoU
-# of the final evaluation, in the hard contact model. Ours come from result files alone, the paper's
-# from `src/plab/report/paper/`.
+# plab's scores compared with those of Huang et al. (PlasticineLab, ICLR 2021): normalised incremental IoU of
+# the final evaluation, in the hard contact model. Ours are read from result files, the paper's from
+# `src/plab/report/paper/`.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -46,10 +46,10 @@ runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
 
 # %% [markdown]
-# ## What there is
+# ## Scores
 #
-# Mean ± standard deviation over variants and seeds. A number in brackets says how many of the expected
-# runs a cell holds.
+# Mean ± standard deviation over variants and seeds. Numbers in brackets are the available and the expected
+# runs of incomplete cells.
 
 # %%
 ours, paper, compared = iou_per_task(runs)
@@ -58,7 +58,7 @@ show_table(ours)
 # %% [markdown]
 # ## Verdicts
 #
-# One rule for all cells.
+# The same rule applies to all cells.
 
 # %%
 VERDICTS = {
@@ -185,8 +185,8 @@ show_figure(drawing)
 # %% [markdown]
 # ## Every configuration
 #
-# Three seeds on each side make wide intervals, so that many configurations stay undecided which are
-# decided per task.
+# With three seeds on each side intervals are wide, so many configurations are undecided although their task is
+# not.
 
 # %%
 per_configuration = verdicts(runs, configurations=True)
@@ -216,11 +216,11 @@ else:
     show_figure(None)
 
 # %% [markdown]
-# ## What can be reached
+# ## Solvability
 #
-# Our targets are made from their parameters or by scripts, the paper's are files, so the two judge
-# somewhat different goals. The demonstrations show what is possible with ours: where a method stays below
-# its demonstration, the method is what falls short, not the task.
+# Our targets are generated from parameters or scripts, the paper's are files, so the goals differ slightly.
+# The demonstrations show the achievable scores for our targets: if a method scores less, the method is the
+# limit, not the task.
 
 # %%
 show_table(solvability(runs)[2])

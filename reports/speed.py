@@ -13,8 +13,7 @@
 # %% [markdown]
 # # Speed
 #
-# Time per environment step beside the paper's, from the benchmark where its file is there, and from the
-# runs themselves.
+# Time per environment step compared with the paper's, from the benchmark file if available, and from the runs.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -76,9 +75,8 @@ with style():
 show_figure(drawing)
 
 # %% [markdown]
-# Runs that share a simulator share its time, so that a run's step takes less time the more runs there are:
-# that is how much a sweep costs, not how long one waits for a step. The benchmark's rows with batch 1 say
-# that.
+# Runs that share a simulator share its time, so the time per step decreases with the number of runs. It is the
+# cost in a sweep, not the latency of a step, which the rows of the benchmark with batch 1 show.
 
 # %%
 show_table(ours)

@@ -173,7 +173,7 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Chamfer distance of two mass tensors, shape [n, n, n] [domain units].
+    """Return the Chamfer distance [domain units] of two mass tensors, each of shape [n, n, n].
 
     Sum of the mean distances from the mass of each tensor to the nearest node of the other. Distances below a
     cell are not resolved.

@@ -83,7 +83,7 @@ function runTable(one, details) {
   const chosen = details[one.best], best = chosen.runs.find((run) => run.hash === chosen.best);
   const commands = [best.command, `plab render ${best.path} --output rollout.mp4`].map((text) => make("code", {}, text));
   return [make("h2", {}, "Runs"), make("div", { class: "scroll" }, make("table", { class: "plain runs" }, make("thead", {}, head), make("tbody", {}, ...body))),
-    make("p", { class: "note" }, "Times of runs that were computed at once are each one's share. The run with the highest score is made again, and drawn, by"), make("div", { class: "commands" }, ...commands)];
+    make("p", { class: "note" }, "Times of runs in a batch are each run's share. The run with the highest score is repeated and rendered by"), make("div", { class: "commands" }, ...commands)];
 }
 
 const curveView = { column: "reward", axis: "episodes", scale: "log", hidden: new Set() };
@@ -113,6 +113,6 @@ function chart(details) {
   redraws.add(draw);
   const head = make("div", { class: "heading" }, make("h2", {}, "Curves"), group("column", content.columns, shortLabels),
     group("axis", content.axes, shortLabels), group("scale", ["log", "linear"], {}));
-  const note = "Lines: mean over the seeds; shaded: one standard deviation. Gradient methods are shown in the contact model of their rollouts (soft, but for Adam-H), RL in the hard one, so ends may differ from the scores above. Rewards and scores below zero count as zero, as in the paper.";
+  const note = "Lines: mean over the seeds; shaded: one standard deviation. Gradient methods are shown in the contact model of their rollouts (soft, except for Adam-H), RL in the hard one, so ends may differ from the scores above. Rewards and scores below zero count as zero, as in the paper.";
   return [head, box, make("p", { class: "note" }, note)];
 }
