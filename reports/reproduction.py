@@ -185,8 +185,8 @@ show_figure(drawing)
 # %% [markdown]
 # ## Every configuration
 #
-# With three seeds on each side intervals are wide, so many configurations are undecided although their task is
-# not.
+# With three seeds on each side intervals are wide, so many configurations are undecided although their task
+# is not.
 
 # %%
 per_configuration = verdicts(runs, configurations=True)

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Speed
 #
-# Time per environment step compared with the paper's, from the benchmark file if available, and from the runs.
+# Time per environment step compared with the paper's, from the benchmark file if available, and from runs.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -75,8 +75,8 @@ with style():
 show_figure(drawing)
 
 # %% [markdown]
-# Runs that share a simulator share its time, so the time per step decreases with the number of runs. It is the
-# cost in a sweep, not the latency of a step, which the rows of the benchmark with batch 1 show.
+# Runs that share a simulator share its time, so the time per step decreases with the number of runs. It is
+# the cost in a sweep, not the latency of a step, which the rows of the benchmark with batch 1 show.
 
 # %%
 show_table(ours)
