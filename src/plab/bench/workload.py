@@ -169,7 +169,7 @@ def time_calls(load: Workload, kind: str, repeats: int) -> tuple[float, np.ndarr
 
 
 def peak_rss_mb() -> float:
-    """Peak resident memory of the process [MB]; NaN where it is not known."""
+    """Peak resident memory of the process [MB]; NaN if unknown."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

@@ -141,7 +141,7 @@ def sources_and_words(
         default: Default source; None: none.
 
     Returns:
-        The sources, and the words.
+        The sources, and the selections.
 
     Raises:
         ArgumentError: If the name of a folder is empty.

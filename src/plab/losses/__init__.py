@@ -1,7 +1,7 @@
 """Losses: functions of a state, and their gradients, one file per term.
 
 :data:`TERMS` lists the terms. Columns of results, entries of ``info`` and labels of reports follow from the
-weights of a configuration. A term is imported when it is made: its name needs no Taichi.
+weights of a configuration. Terms are imported on creation, so that their names are available without Taichi.
 """
 
 from __future__ import annotations

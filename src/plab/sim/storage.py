@@ -1,4 +1,4 @@
-"""Memory of the batched simulator: constants fixed when it is built, and Taichi fields.
+"""Memory of the batched simulator: compile-time constants and Taichi fields.
 
 Layout. Particle state is one array of tiles: a tile holds ``lanes`` particles, each of its 24 entries a
 vector of lanes (x 0:3, v 3:6, C 6:15, F 15:24), so that the material update runs on SIMD registers on the
@@ -105,8 +105,8 @@ class Storage:
     ) -> None:
         """Allocate the fields of forward simulation for scenes that differ only in per-environment data,
         which :meth:`fill_parameters` writes. With ``full_gradient`` gradients include those with respect to
-        initial state and material. The CPU is ``deterministic`` in any case. With ``singular_values`` the
-        series of :mod:`plab.laws.von_mises` serve no particle."""
+        initial state and material. The CPU is always ``deterministic``. With ``singular_values`` the series
+        of :mod:`plab.laws.von_mises` are not used."""
         # Fields that the host reads or writes: number, field, components.
         self.shared: list[tuple[int, ti.Field, int]] = []
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.

@@ -266,7 +266,7 @@ class MassTarget(TensorRecipe):
 
 @lru_cache(maxsize=8)
 def read_points(file: str, _sha256: str = "") -> np.ndarray:
-    """Read a point cloud from a NumPy, PLY or XYZ file, once for each content.
+    """Read a point cloud from a NumPy, PLY or XYZ file, cached by content.
 
     Returns:
         Positions, shape [point, 3], float64, finite.
@@ -294,7 +294,7 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _read_tensor(file: str, _sha256: str) -> np.ndarray:
-    """Read a mass tensor, float64, once for each content."""
+    """Read a mass tensor, float64, cached by content."""
     mass = _numbers(file, "a mass tensor: give .npy")
     below = -mass.clip(max=0.0).sum()
     if not np.isfinite(mass).all() or not below <= _NEGATIVE * mass.sum() or not mass.any():
