@@ -18,8 +18,8 @@ from plab.cli.main import COMMANDS
 from plab.cli.main import main as command_line
 from plab.cli.run import parser
 from plab.config import choices, load_config
+from plab.config.overrides import parse, prepared, swept
 from plab.config.selection import select
-from plab.config.words import parse, prepared, swept
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("README.md", "CONTRIBUTING.md", "docs/*.md", "src/**/README.md")

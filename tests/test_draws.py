@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import plab
 from plab.config import ConfigError, load_config
-from plab.config.draws import ranges_of
+from plab.config.randomization import ranges_of
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem

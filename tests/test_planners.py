@@ -20,6 +20,7 @@ from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
 from plab.runners import RunError, run_batch, run_config, tracks
 from plab.runners.planners import planner
+from plab.runners.planners.contact_starts import ContactStarts
 from plab.runners.planners.planner import (
     Answer,
     CandidateStart,
@@ -27,7 +28,6 @@ from plab.runners.planners.planner import (
     make_planner,
 )
 from plab.runners.planners.searches import actions_of, knots_of
-from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles
 from plab.sweep.running import plan

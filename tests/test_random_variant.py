@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from plab.config import ConfigError, TaskConfig, choices, load_config
 from plab.config.compose import compose
-from plab.config.draws import FIRST_TARGET_SEED, draw_variant
+from plab.config.randomization import FIRST_TARGET_SEED, draw_variant
 
 SCENES = 12
 """Draws of each task, of which the least and the largest are more than half of a range apart."""

@@ -19,9 +19,9 @@ from plab.cli.command import Parser, command_line, finished_rows, folder, positi
 from plab.cli.tables import print_table
 from plab.config import Config
 from plab.config.compose import check_sources, require_runnable
+from plab.config.overrides import parse, prepared
 from plab.config.selection import OBSERVATION_KEYS
 from plab.config.suite import SUITE_VARIANTS
-from plab.config.words import parse, prepared
 from plab.demonstrations import known_actions
 from plab.demonstrations.minari import DatasetError, Episode, write_dataset
 from plab.envs.core import EpisodeBatch

@@ -18,7 +18,7 @@ from plab.config.compose import (
     compose_with_hydra,
     require_runnable,
 )
-from plab.config.words import parse, prepared
+from plab.config.overrides import parse, prepared
 
 _OF_SWEEPS = re.compile(r"[+]*hydra[./](launcher|sweep)")
 

@@ -26,9 +26,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config.families import family
+from plab.config.overrides import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.config.words import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3
@@ -261,7 +261,7 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     Raises:
         ConfigError: If the task is not an unmodified task of the suite, or has no section ``random``.
     """
-    from plab.config.draws import with_own_materials
+    from plab.config.randomization import with_own_materials
 
     name, own = cfg.task.name, [f"variant={cfg.variant}"]
     if cfg.seed_scene is not None:
@@ -442,7 +442,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     """Merge the variant, sampled if random, into the task, and remove the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
-        from plab.config.draws import draw_variant
+        from plab.config.randomization import draw_variant
 
         drawn = draw_variant(task, composed.seed_scene)
         _refuse_undone(overrides, drawn, "variant=random")

@@ -50,7 +50,7 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     # Imported here, because Hydra is slow to import and not needed without overrides.
     from hydra.core.override_parser.types import OverrideType
 
-    from plab.config.words import parse, prepared, swept
+    from plab.config.overrides import parse, prepared, swept
 
     chosen = Selection()
     for override in parse(prepared(words)):

@@ -289,8 +289,8 @@ class TaskConfig(ranges.Section):
         variants: Overrides of the task by variant, in the structure of the task.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
-        randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.draws`; empty: no
-            randomisation.
+        randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.randomization`;
+            empty: no randomisation.
         cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
         stages: Targets, like ``target``, that environments present in sequence before ``target``; runs use
             only ``target``.
@@ -331,7 +331,7 @@ class TaskConfig(ranges.Section):
             except TargetError as error:
                 raise ConfigError(f"{path}.{place}{error}") from None
         if self.randomize:
-            from plab.config.draws import ranges_of
+            from plab.config.randomization import ranges_of
 
             ranges_of(self)
         for name, camera in self.cameras.items():

@@ -17,11 +17,11 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config
-from plab.config.draws import Values, with_own_materials
+from plab.config.overrides import prepared
+from plab.config.randomization import Values, with_own_materials
 from plab.config.selection import OBSERVATION_KEYS
-from plab.config.words import prepared
-from plab.envs.draws import EpisodeRandomizer
 from plab.envs.observations import Observer, Sensors, mapped, spaces
+from plab.envs.randomization import EpisodeRandomizer
 from plab.envs.stages import Stages, staged
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of, make_simulator
@@ -265,7 +265,7 @@ class EpisodeBatch:
                 keys such as ``state`` and ``front_depth``.
             cameras: Cameras by name, or their attributes; default: the task's, or one named ``front``.
             randomize: Ranges of randomised parameters, replacing those of the tasks, see
-                :mod:`plab.config.draws`; empty: none.
+                :mod:`plab.config.randomization`; empty: none.
             impulses: Whether ``info`` contains the impulses on the manipulators; always if they are observed.
             stages: Whether episodes begin with the targets of ``task.stages``; set by :func:`make_batch`.
             success_score: Least score of a success.

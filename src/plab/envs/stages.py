@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from plab.config import Config, ConfigError
-from plab.config.draws import SCENES
+from plab.config.randomization import SCENES
 from plab.problem import Problem, make_targets, target_distance
 
 __all__ = ["Stages", "staged"]

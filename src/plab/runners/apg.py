@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from plab.config import MethodConfig, ranges
-from plab.config.draws import without_draws
 from plab.config.families import GRADIENT, Appearance, Family
+from plab.config.randomization import without_draws
 from plab.plugins import torch
 from plab.runners.policy import Spaces, packed, torch_settings, unpacked
 from plab.runners.runner import Runner, Step, Track

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from plab.config import Config, ConfigError
-from plab.config.draws import without_draws
+from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
 from plab.plugins import torch
 from plab.results import ResultsError

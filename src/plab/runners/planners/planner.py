@@ -113,7 +113,7 @@ class CandidateStart:
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
         """Keep scene and target, a mass tensor of shape [n, n, n]."""
-        from plab.runners.planners.starts import ContactStarts
+        from plab.runners.planners.contact_starts import ContactStarts
 
         self.shape, self.device = (scene.horizon, scene.action_dim), device
         self._contact = ContactStarts(scene, target)

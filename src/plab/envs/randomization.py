@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene
-from plab.config.draws import (
+from plab.config.randomization import (
     NOISE,
     SCENE,
     SCENES,
@@ -66,7 +66,8 @@ class EpisodeRandomizer:
         """Check that scenes can be simulated over the whole ranges, and build the random scenes.
 
         Args:
-            cfgs: One configuration per sub-environment, :func:`~plab.config.draws.with_own_materials`.
+            cfgs: One configuration per sub-environment, see
+                :func:`~plab.config.randomization.with_own_materials`.
             problem: Their scenes and targets.
 
         Raises:

@@ -22,9 +22,9 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.config.overrides import explain, variant_changes
 from plab.config.run import Config
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
-from plab.config.words import explain, variant_changes
 from plab.errors import ConfigError, pick
 from plab.scenes import MATERIAL_KEYS, Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
