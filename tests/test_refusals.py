@@ -234,7 +234,7 @@ def test_calls_from_python(case):
 def test_rollouts_of_no_steps_and_of_no_numbers():
     simulator = Simulator([scene(("Sphere",))])
     for given in (np.zeros((1, 0, simulator.action_dim)), [["a"]], [[0.0], [0.0, 1.0]]):
-        with pytest.raises(PlabError, match="actions (have|must be) "):
+        with pytest.raises(PlabError, match=r"actions (have|must be) "):
             simulator.rollout(given, gradient=False)
 
 
