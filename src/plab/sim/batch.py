@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plab.errors import ArgumentError
 from plab.scenes import MATERIAL_KEYS, Material, Scene, SceneError, find_law
 
 SHARED = (
@@ -71,6 +72,29 @@ def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
 def _unit(rotation: Sequence[float]) -> list[float]:
     q = np.asarray(rotation, float)
     return list(q / np.linalg.norm(q))
+
+
+def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "particles") -> np.ndarray:
+    """Return particle positions, shape [..., particle, 3], as float64.
+
+    Raises:
+        ValueError: If their number is wrong, or a position is NaN or outside the grid; the message names it
+            and the limits.
+    """
+    x = np.asarray(x, np.float64)
+    if x.ndim < 2 or x.shape[-1] != 3:
+        raise ArgumentError(f"{label} have shape {list(x.shape)}, not [particle, 3]")
+    if x.shape[-2] != particles:
+        raise ArgumentError(f"{label} are {x.shape[-2]}, but the scene has {particles}")
+    low, high = -0.5 / nodes, 1.0 - 1.5 / nodes
+    # NaN must fail this comparison, too.
+    inside = np.all((x >= low) & (x < high), axis=-1)
+    if not inside.all():
+        first = tuple(np.argwhere(~inside)[0].tolist())
+        where = f"environment {first[0]}, particle {first[1]}" if len(first) > 1 else f"particle {first[0]}"
+        at = ", ".join(f"{value:.4g}" for value in x[first])
+        raise ArgumentError(f"{label}: {where} is at ({at}), outside {low:.4g} .. {high:.4g}")
+    return x
 
 
 def material_keys(scene: Scene) -> tuple[str, ...]:

@@ -502,23 +502,14 @@ class CpuEngine(CpuPhases):
                         self.advance_manipulators(e, actions, poses, t, pose_before, pose_after)
                     for s in range(self.substeps):
                         before = slot + s * stride
-                        after = before + stride
+                        after, now = before + stride, stamp + s
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
                             self.scatter_chunk(
-                                state,
-                                state_at,
-                                before,
-                                before + stride,
-                                state,
-                                state_at,
-                                e,
-                                c,
-                                stamp + s,
-                                False,
+                                state, state_at, before, after, state, state_at, e, c, now, False
                             )
                         self.barrier(team, size)
                         if rank == 0:
-                            self.collect_blocks(e, stamp + s)
+                            self.collect_blocks(e, now)
                         self.barrier(team, size)
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
                             self.grid_chunk(e, c, s)

@@ -54,39 +54,27 @@ class TilePhases(ParticlePhases):
     code_device = "cpu"
 
     @ti.func
-    def call(
-        self,
-        unit: ti.template(),
-        name: ti.template(),
-        at: ti.template(),
-        sizes: ti.template(),
-        numbers: ti.template(),
-    ):
-        """Call a function of the bitcode with addresses, integers and numbers.
+    def arguments(self, unit: ti.template(), at: ti.template(), numbers: ti.template()):
+        """Return addresses, the nodes per axis for ``transfers``, and numbers as bitcode takes them.
 
         Addresses are those of a node in a grid, of one particle's number in the first of some lane vectors,
         and of a tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
         """
         a = [local_variable(ti.cast(address, ti.u64)) for address in at]
-        i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
+        i = [local_variable(ti.cast(self.axis, ti.i64)) for _ in range(1 if unit == "transfers" else 0)]
         n = [local_variable(ti.cast(number, self.real)) for number in numbers]
-        ti.static(self.function(unit, name))(*a, *i, *n)
+        return a + i + n
 
     @ti.func
-    def ask(
-        self,
-        unit: ti.template(),
-        name: ti.template(),
-        at: ti.template(),
-        sizes: ti.template(),
-        numbers: ti.template(),
-    ):
-        """Call a function of the bitcode as :meth:`call` does, and return its result, a number."""
-        a = [local_variable(ti.cast(address, ti.u64)) for address in at]
-        i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
-        n = [local_variable(ti.cast(number, self.real)) for number in numbers]
+    def call(self, unit: ti.template(), name: ti.template(), at: ti.template(), numbers: ti.template()):
+        """Call a function of the bitcode."""
+        ti.static(self.function(unit, name))(*self.arguments(unit, at, numbers))
+
+    @ti.func
+    def ask(self, unit: ti.template(), name: ti.template(), at: ti.template(), numbers: ti.template()):
+        """Call a function of the bitcode that returns a number."""
         result = ti.cast(0.0, self.real)
-        ti.static(self.function(unit, name))(*a, *i, *n, result)
+        ti.static(self.function(unit, name))(*self.arguments(unit, at, numbers), result)
         return result
 
     def _allocate(self) -> None:
@@ -172,13 +160,7 @@ class TilePhases(ParticlePhases):
         grid, stencil = ti.get_addr(self.momentum, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + MOMENTUM_FIELD, lane)
         a = self.lane_in(self.affine, entry9, lane)
-        self.call(
-            "transfers",
-            "scatter",
-            [grid, stencil, value, a],
-            [self.axis],
-            [self.mass, self.dx],
-        )
+        self.call("transfers", "scatter", [grid, stencil, value, a], [self.mass, self.dx])
 
     @ti.func
     def scatter_adjoint(self, bar_at, target, lane, grid_node, at):
@@ -187,13 +169,7 @@ class TilePhases(ParticlePhases):
         grid, stencil = ti.get_addr(self.velocity_bar, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + ADJOINT_FIELD, lane)
         c_bar = self.lane_of(bar_at, target + AT_C, lane)
-        self.call(
-            "transfers",
-            "scatter",
-            [grid, stencil, value, c_bar],
-            [self.axis],
-            [0.0, 4.0 * self.inv_dx],
-        )
+        self.call("transfers", "scatter", [grid, stencil, value, c_bar], [0.0, 4.0 * self.inv_dx])
 
     @ti.func
     def gather_particle(self, state_at, source, target, lane, node, e, time, at):
@@ -204,13 +180,7 @@ class TilePhases(ParticlePhases):
             self.lane_of(state_at, source, lane),
             self.lane_of(state_at, target, lane),
         ]
-        speed = self.ask(
-            "transfers",
-            "gather",
-            addresses,
-            [self.axis],
-            [self.dt, self.x_max, 4.0 * self.inv_dx],
-        )
+        speed = self.ask("transfers", "gather", addresses, [self.dt, self.x_max, 4.0 * self.inv_dx])
         self.note_speed(speed, e, time)
 
     @ti.func
@@ -227,13 +197,7 @@ class TilePhases(ParticlePhases):
             self.lane_of(bar_at, target, lane),
         ]
         numbers = [self.dt, self.x_max, self.dx, self.inv_dx, self.mass]
-        self.call(
-            "transfers",
-            "gather_adjoint",
-            addresses,
-            [self.axis],
-            numbers,
-        )
+        self.call("transfers", "gather_adjoint", addresses, numbers)
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 
@@ -330,15 +294,9 @@ class TilePhases(ParticlePhases):
         affine = self.lane_in(self.affine, entry9, 0)
         numbers = [number, self.dt, self.stress_scale, self.mass]
         if ti.static(update):
-            self.call(
-                number,
-                "update",
-                [first, x, affine, self.lane_of(state_at, target, 0)],
-                [],
-                numbers,
-            )
+            self.call(number, "update", [first, x, affine, self.lane_of(state_at, target, 0)], numbers)
         else:
-            self.call(number, "stress_only", [first, x, affine], [], numbers)
+            self.call(number, "stress_only", [first, x, affine], numbers)
 
     @ti.func
     def strain_tile(self, state_at, source, e, entry9, at, number: ti.template(), kind: ti.template()):
@@ -347,7 +305,7 @@ class TilePhases(ParticlePhases):
         self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
         addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
         limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return self.ask(number, kind, addresses, [], limits) > 0.0
+        return self.ask(number, kind, addresses, limits) > 0.0
 
     @ti.func
     def scheduled_tile(
@@ -367,13 +325,13 @@ class TilePhases(ParticlePhases):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine = self.lane_in(self.affine, entry9, 0)
             numbers = [number, self.stress_scale, self.mass]
-            rigid = self.ask(number, "stress", [first, x, affine], [], numbers)
+            rigid = self.ask(number, "stress", [first, x, affine], numbers)
             if ti.static(update):
                 addresses = [first, self.lane_of(state_at, target, 0)]
                 if rigid < 1.0:
-                    self.call(number, "flow", addresses, [], [number])
+                    self.call(number, "flow", addresses, [number])
                 else:
-                    self.call(number, "rest", addresses, [], [number])
+                    self.call(number, "rest", addresses, [number])
         else:
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):
@@ -410,7 +368,7 @@ class TilePhases(ParticlePhases):
         first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
         addresses = [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)]
         numbers = [number, self.dt, self.stress_scale, self.mass]
-        self.call(number, "adjoint", addresses, [], numbers)
+        self.call(number, "adjoint", addresses, numbers)
         if ti.static(self.full_gradient):
             self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, self.laws[number].size, number)
 
@@ -432,16 +390,16 @@ class TilePhases(ParticlePhases):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
             numbers = [number, self.stress_scale]
-            rigid = self.ask(number, "stress_adjoint", [first, affine], [], numbers)
+            rigid = self.ask(number, "stress_adjoint", [first, affine], numbers)
             if rigid < 1.0:
-                self.call(number, "flow_adjoint", [first, bars], [], [number])
+                self.call(number, "flow_adjoint", [first, bars], [number])
             else:
-                self.call(number, "rest_adjoint", [first, bars], [], [number])
+                self.call(number, "rest_adjoint", [first, bars], [number])
             if ti.static(self.full_gradient):
                 self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
             ends = [number, self.dt, self.mass]
             addresses = [first, x, affine, bars]
-            self.call(number, "strain_adjoint", addresses, [], ends)
+            self.call(number, "strain_adjoint", addresses, ends)
         else:
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):

@@ -145,6 +145,32 @@ class ParticlePhases(Storage):
                 for i in ti.static(range(6)):
                     out[row * 6 + i] = state[entry + i][place % self.lanes]
 
+    @ti.kernel
+    def copy_chosen(self, source: Array, target: Array, chosen: Array):
+        """Copy the particle states of environments with a nonzero entry in ``chosen``."""
+        for q in range(self.batch * self.tiles * self.lanes):
+            e, place = self.particle_of(q)
+            if chosen[e] != 0:
+                entry = self.tile_entry(0, e, place // self.lanes)
+                for i in range(STATE):
+                    lane = place % self.lanes
+                    target[entry + i][lane] = source[entry + i][lane]
+
+    @ti.kernel
+    def place_at_rest(self, target: Array, e: ti.i32, order: Array, x: Array):
+        """Write particles at rest to an environment's state, given the particle number of each place."""
+        for place in range(self.particles):
+            entry = self.tile_entry(0, e, place // self.lanes)
+            lane = place % self.lanes
+            for i in range(STATE):
+                value = 0.0
+                if i == AT_F or i == AT_F + 4 or i == AT_F + 8:
+                    value = 1.0
+                if i < 3:
+                    target[entry + i][lane] = ti.cast(x[3 * order[place] + i], self.real)
+                else:
+                    target[entry + i][lane] = ti.cast(value, self.real)
+
     @ti.func
     def stencil(self, x):
         """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5), in the

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,13 +12,19 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
-from plab.sim.batch import initial_poses, material_keys, parameter_gradient, require_alike, with_material
+from plab.sim.batch import (
+    checked_positions,
+    initial_poses,
+    material_keys,
+    parameter_gradient,
+    require_alike,
+    with_material,
+)
 from plab.sim.compiler import ti
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
 from plab.sim.runtime import is_current, register_user, start_runtime
-from plab.sim.starts import Starts, checked_positions
 from plab.sim.state import (
     Measures,
     Rollout,
@@ -31,7 +36,7 @@ from plab.sim.state import (
     rest_state,
 )
 from plab.sim.tape import ClosedLoop, RecordedStates, Tape
-from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
+from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
 from plab.sim.term_phases import LossTerm
 
 if TYPE_CHECKING:
@@ -130,7 +135,6 @@ class Simulator:
         self._impulses = ti.ndarray(ti.f64, shape=max(1, size)) if impulses else None
         self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
-        self._starts = Starts(self._engine)
         self._initial = self._particles.array(1)
         self._drive: LinkMotion | None = None
         self._joints: Any = None
@@ -284,7 +288,7 @@ class Simulator:
         self._start_manipulators()
         for e, x in held.items():
             order = self._particles.order.initial[e].astype(np.int32)
-            self._starts.place_at_rest(self._initial, e, order, x.reshape(-1))
+            self._engine.place_at_rest(self._initial, e, order, x.reshape(-1))
 
     # -- forward ------------------------------------------------------------------------------------
 
@@ -298,7 +302,7 @@ class Simulator:
             if self._impulses is not None:
                 kept = np.array(self.impulses()) * (chosen == 0)[:, None, None]
                 copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, 1)
-            self._starts.copy_chosen(self._initial, self._particles.current, chosen)
+            self._engine.copy_chosen(self._initial, self._particles.current, chosen)
             self._particles.order.reset(environments)
             poses = np.array(self.poses())
             poses[chosen != 0] = self._initial_poses[chosen != 0]
@@ -330,7 +334,7 @@ class Simulator:
         self._require_runtime()
         self._version += 1
         through = (lambda given: self._follow(given, False).twists) if self._map else None
-        array = step_actions(actions, self.batch, self.action_dim, self.device, through)
+        array = kernel_actions(actions, self._engine, self.action_dim, through)
         # Discard the impulses of earlier rollouts.
         self._take_impulses()
         self._particles.step(self._pose, array)
@@ -620,42 +624,9 @@ class Simulator:
             SimulationError: If state, loss or gradient stop being finite.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
-        self._require_runtime()
         if not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
-        self._version += 1
-        # Contact before these steps does not depend on their actions.
-        self._engine.write(self._engine.touched, np.zeros(self.batch))
-        plan = self._tape.plan(steps, self.memory_mb)
-        poses = self._pose_history(steps, cast(np.ndarray, self.poses()))
-        terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
-        observe = functools.partial(self._observe, stride=stride, like=like)
-        follow = self._follow if self._map else None
-        loop = ClosedLoop(
-            self._particles,
-            poses,
-            steps,
-            choose,
-            react,
-            observe,
-            stride,
-            discount,
-            like,
-            self.action_dim,
-            follow,
-        )
-        loop.observe_step(0, self._particles.current, 0)
-        self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.note)
-        require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
-        before = self.steps_before_contact(steps)
-        with self._kept_weights() as loop.weights:
-            self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
-        bars = numbers_of(loop.actions_bar, (steps, self.batch, self._engine.actions_per_step), like)
-        require_none(broken_gradients(bars.swapaxes(0, 1)))
-        loop.react_at(0)
-        self._engine.place(poses, steps, self._pose, 0)
-        values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), like)
-        return self._judged(values).terms[1:].swapaxes(0, 1)
+        return ClosedLoop(self, steps, choose, react, stride, discount, like).run()
 
     def state_gradient(self) -> State:
         """Return the gradient of the last :meth:`rollout`'s loss with respect to its initial state.
@@ -730,7 +701,7 @@ class Simulator:
         gradient."""
         self.reset()
         through = (lambda given: self._follow(given, gradient).twists) if self._map else None
-        array = action_array(actions, self.batch, self.action_dim, self.device, through)
+        array = kernel_actions(actions, self._engine, self.action_dim, through, rollout=True)
         steps = np.shape(actions)[1]
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         return array, steps, self._pose_history(steps, self._initial_poses), plan

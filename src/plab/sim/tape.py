@@ -12,13 +12,15 @@ from plab.errors import ArgumentError
 from plab.sim.compiler import ti
 from plab.sim.memory import ENTRIES_MAX, held_bytes, segment_length
 from plab.sim.particles import Particles
+from plab.sim.state import broken_gradients, broken_states, require_none
 from plab.sim.storage import AT_V
-from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, step_actions
+from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
 
 if TYPE_CHECKING:
     import torch
 
     from plab.kinematics.actions import LinkMotion
+    from plab.sim.simulator import Simulator
 
 
 class Tape:
@@ -366,34 +368,50 @@ class ClosedLoop:
 
     def __init__(
         self,
-        particles: Particles,
-        poses: ti.Ndarray,
+        simulator: Simulator,
         steps: int,
         choose: Callable[[int, Any, Any], Any],
         react: Callable[[int, Any], tuple[Any, Any] | None],
-        observe: Callable[[ti.Ndarray, int], Any],
         stride: int,
         discount: float,
         like: torch.Tensor | None,
-        components: int,
-        follow: Callable[[Any], LinkMotion] | None,
     ) -> None:
-        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array; ``follow``
-        moves the joints of articulated models by actions with ``components`` entries. Other arguments are as
-        in :meth:`plab.sim.Simulator.closed_loop`."""
-        self._particles, self._engine = particles, particles.engine
-        self._poses, self._steps, self._stride = poses, steps, stride
-        self._choose, self._react, self._observe = choose, react, observe
-        self._discount, self._like = discount, like
-        self._components, self._follow = components, follow
+        """Start from the current state; arguments as in :meth:`plab.sim.Simulator.closed_loop`."""
+        simulator._require_runtime()
+        self._simulator, self._engine, self._particles = simulator, simulator._engine, simulator._particles
+        self._steps, self._choose, self._react = steps, choose, react
+        self._stride, self._discount, self._like = stride, discount, like
         self._drives: list[LinkMotion] = []
         self._joints_bar: Any = None
         engine = self._engine
         self._row = engine.batch * engine.actions_per_step
         self.actions = ti.ndarray(ti.f64, shape=max(1, steps * self._row))
         self.actions_bar = ti.ndarray(ti.f64, shape=self.actions.shape)
+        self._poses = simulator._pose_history(steps, np.asarray(simulator.poses()))
         # Particle order at each observation.
         self._numbers: list[ti.Ndarray] = []
+
+    def run(self) -> np.ndarray | torch.Tensor:
+        """Simulate forward and back; results and errors of :meth:`plab.sim.Simulator.closed_loop`."""
+        simulator, engine, steps = self._simulator, self._engine, self._steps
+        simulator._version += 1
+        # Contact before these steps does not depend on their actions.
+        engine.write(engine.touched, np.zeros(engine.batch))
+        tape = simulator._tape
+        plan = tape.plan(steps, simulator.memory_mb)
+        terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
+        self.observe_step(0, self._particles.current, 0)
+        tape.forward(self.actions, self._poses, None, steps, plan, after=self.note)
+        require_none(broken_states(engine.read(engine.fault), engine.substeps))
+        before = simulator.steps_before_contact(steps)
+        with simulator._kept_weights() as self.weights:
+            tape.backward(self.actions, self._poses, terms, steps, before, self.add, self.actions_bar)
+        bars = numbers_of(self.actions_bar, (steps, engine.batch, engine.actions_per_step), self._like)
+        require_none(broken_gradients(bars.swapaxes(0, 1)))
+        self.react_at(0)
+        engine.place(self._poses, steps, simulator._pose, 0)
+        values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), self._like)
+        return simulator._judged(values).terms[1:].swapaxes(0, 1)
 
     def observe_step(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Observe the state before step t, in a time slot of an array, and choose its actions."""
@@ -401,16 +419,15 @@ class ClosedLoop:
         self._numbers.append(self._particles.order.noted())
         shape = engine.batch, engine.manipulators, 8
         poses = numbers_of(self._poses, shape, self._like, first=t * int(np.prod(shape)))
-        chosen = self._choose(t, self._observe(state, slot), poses)
+        seen = self._simulator._observe(state, slot, self._stride, self._like)
+        chosen = self._choose(t, seen, poses)
         if t < self._steps:
-            device = "cuda" if engine.cuda else "cpu"
-            through = self._moved if self._follow else None
-            row = step_actions(chosen, engine.batch, self._components, device, through)
+            through = self._moved if self._simulator._map else None
+            row = kernel_actions(chosen, engine, self._simulator.action_dim, through)
             copy_numbers(self.actions, t * self._row, row, self._row, 1)
 
     def _moved(self, actions: Any) -> Any:
-        assert self._follow is not None
-        self._drives.append(self._follow(actions))
+        self._drives.append(self._simulator._follow(actions))
         return self._drives[-1].twists
 
     def note(self, t: int, state: ti.Ndarray, slot: int) -> None:

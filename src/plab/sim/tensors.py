@@ -85,52 +85,42 @@ def numbers_of(
     return out
 
 
-def step_actions(
+def kernel_actions(
     actions: "np.ndarray | torch.Tensor",
-    batch: int,
+    engine: Any,
     components: int,
-    device: str,
     through: Callable[[Any], Any] | None = None,
+    *,
+    rollout: bool = False,
 ) -> "np.ndarray | torch.Tensor | ti.Ndarray":
-    """Return the actions of one environment step for the kernels, shape [batch, component], float64, on the
-    device they are on.
+    """Return actions for the kernels, flat and in float64.
 
     Args:
-        actions: The actions.
-        batch: Number of environments.
+        actions: Actions of one environment step, shape [batch, component], which stay on their device; or of
+            a rollout, shape [batch, T, component], which become a Taichi array ordered by step.
+        engine: The kernels.
         components: Number of components.
-        device: ``cpu`` or ``cuda``.
         through: Function that converts checked actions, shape [T, batch, component], to actions of the
             manipulators.
+        rollout: Whether the actions are those of a rollout.
 
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
-    numbers = _numbers(actions, (batch, components))
+    batch = engine.batch
+    numbers = _numbers(actions, (batch, None, components) if rollout else (batch, components))
     if through is not None:
-        numbers = through(numbers.reshape(1, batch, components)).reshape(-1)
-    if on_device(numbers) and device == "cuda" and numbers.shape[0]:
-        # Another stream might reuse the memory before the kernels have read it.
-        return numbers if _in_default_stream() else _array_of(numbers, device)
+        numbers = through(numbers.reshape(-1, batch, components)).reshape(-1)
+    stays = on_device(numbers) and engine.cuda and numbers.shape[0] > 0
+    if stays and not rollout and _in_default_stream():
+        return numbers
+    # Another stream might reuse a tensor's memory before the kernels have read it.
+    if rollout or stays:
+        return _array_of(numbers, engine.cuda)
     # Copy, because Taichi assumes that kernels may write to arrays.
     array = np.zeros(max(1, numbers.shape[0]))
     array[: numbers.shape[0]] = numbers.cpu() if on_device(numbers) else numbers
     return array
-
-
-def action_array(
-    actions: "np.ndarray | torch.Tensor",
-    batch: int,
-    components: int,
-    device: str,
-    through: Callable[[Any], Any] | None = None,
-) -> ti.Ndarray:
-    """Return the actions of a rollout, shape [batch, T, component], for the kernels, ordered by step,
-    float64; arguments and errors as for :func:`step_actions`."""
-    numbers = _numbers(actions, (batch, None, components))
-    if through is not None:
-        numbers = through(numbers.reshape(-1, batch, components)).reshape(-1)
-    return _array_of(numbers, device)
 
 
 def _numbers(
@@ -163,11 +153,11 @@ def _numbers(
     return flat
 
 
-def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
+def _array_of(numbers: "np.ndarray | torch.Tensor", cuda: bool) -> ti.Ndarray:
     array = ti.ndarray(ti.f64, shape=max(1, numbers.shape[0]))
     if not numbers.shape[0]:
         return array
-    if on_device(numbers) and device == "cuda":
+    if on_device(numbers) and cuda:
         copy_numbers(array, 0, numbers, numbers.shape[0], 1)
         if not _in_default_stream():
             ti.sync()
