@@ -7,9 +7,11 @@ import sys
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from plab.sim import compiler
+from plab.config import build_scene, load_config
+from plab.sim import Simulator, compiler
 from plab.sim.compiler import QUADRANTS, ti
 from plab.sim.runtime import available_threads, remove_stale_cache_lock, start_runtime
 
@@ -63,3 +65,17 @@ def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
     del former, own
     gc.collect()
     assert freed == [kept]
+
+
+@pytest.mark.skipif(QUADRANTS or not os.path.exists("/proc/self/statm"), reason="of Taichi, on Linux")
+def test_dropped_simulators_free_their_fields_beside_another() -> None:
+    scene = build_scene(load_config(["task=Move", "sim.particles_scale=0.02"]))
+    kept, resident = Simulator([scene]), []
+    for _ in range(6):
+        Simulator([scene])
+        with open("/proc/self/statm") as file:
+            resident.append(int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6)
+    # Its fields are 40 MB.
+    assert resident[-1] - resident[1] < 80.0
+    kept.step(np.zeros((1, kept.action_dim)))
+    assert np.isfinite(kept.state().x).all()

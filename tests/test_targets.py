@@ -117,16 +117,11 @@ def test_refused_targets(rope):
         (RING | {"recipe": "rings"}, "'rings'"),
         ({k: v for k, v in RING.items() if k != "radius"}, r"target\.radius"),
         (RING | {"radus": 1}, r"target\.radus"),
-        (RING | {"radius": "wide"}, r"target\.radius"),
         (RING | {"around": 3}, "around 3"),
-        (RING | {"around": -1}, "around -1"),
         (RING | {"section": 0.3}, "section 0.3 .*0.135"),
-        (RING | {"section": 0}, "section 0"),
         (RING | {"radius": 0.6}, "0.9531"),
-        (RING | {"floor": -0.1}, "domain"),
         ({"recipe": "bodies", "bodies": {}}, "bodies"),
         (bodies(**BALL | {"center": [0.5, 0.5]}), r"bodies\.a\.center"),
-        (bodies(**BALL | {"size": []}), "1 positive size"),
         (bodies(**BALL | {"size": [-0.1]}), "sizes"),
         (bodies(**BALL | {"size": [0.6]}), r"bodies\[0\]: .* x"),
         (bodies(**BALL | {"shape": "ball"}), "'ball'"),
@@ -236,11 +231,9 @@ def test_release_files_that_are_refused(tmp_path, released):
     for changed, named in (
         (None, ""),
         (mass[:32], r"\(32, 64, 64\)"),
-        (mass - 1e-9, "-1e-09"),
         (few(mass, -1e-4), "4.92 .*-0.0001"),
         (mass * 64, "640000 .*10000"),
         (np.where(mass > 1e-4, np.nan, mass), "finite"),
-        (mass.astype(str), "numbers"),
         (b"not an array", "NumPy"),
     ):
         if isinstance(changed, bytes):

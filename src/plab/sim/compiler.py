@@ -32,6 +32,7 @@ if QUADRANTS:
     grid_memory_fence = ti.simt.grid.mem_fence
 else:
     import taichi as ti
+    from taichi._snode.fields_builder import FieldsBuilder
     from taichi.lang import _ndarray, impl
     from taichi.lang import kernel_impl as _traced
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
@@ -169,6 +170,27 @@ def guard_array_release() -> None:
             free(self)
 
     kind.__init__, kind.__del__ = made, freed
+
+
+def place_fields() -> Any:
+    """Place the fields declared so far in memory of their own, and return its handle for :func:`free_fields`;
+    None without such fields: uses ``impl._root_fb``.
+
+    Otherwise Taichi places them at the next launch, and frees them only when it is reinitialised.
+    """
+    if QUADRANTS or impl._root_fb.empty:
+        return None
+    tree = impl._root_fb.finalize()
+    impl._root_fb = FieldsBuilder()
+    return tree.ptr
+
+
+def free_fields(handle: Any) -> None:
+    """Free fields that no kernel uses any more.
+
+    ``SNodeTree.destroy`` would also have the kernels of all other simulators compiled anew.
+    """
+    handle.destroy_snode_tree(impl.get_runtime().prog)
 
 
 def address_of(array: ti.Ndarray) -> int:

@@ -13,6 +13,7 @@ import time
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from plab.errors import ArgumentError, PlabError
 from plab.scenes import DEVICES, PRECISIONS
@@ -21,7 +22,9 @@ from plab.sim.compiler import (
     clear_kernel_arguments,
     cuda_available,
     defer_position_lookup,
+    free_fields,
     guard_array_release,
+    place_fields,
     ti,
 )
 
@@ -73,6 +76,7 @@ class Runtime:
 
 _current: Runtime | None = None
 _users: weakref.WeakSet = weakref.WeakSet()
+_dropped: list[tuple[Runtime, Any]] = []
 _process: int | None = None
 _thread: int | None = None
 
@@ -125,6 +129,10 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
             # Some may only await garbage collection.
             gc.collect()
             if len(_users) > 0:
+                while _dropped:
+                    runtime, handle = _dropped.pop()
+                    if runtime is _current:
+                        free_fields(handle)
                 return _current
     if device == "cuda" and not cuda_available():
         raise DeviceError(
@@ -206,6 +214,13 @@ def in_use() -> Runtime | None:
 def register_user(user: object) -> None:
     """Register an object that holds memory of the runtime."""
     _users.add(user)
+
+
+def own_fields(owner: object) -> None:
+    """Place the fields just declared on the CPU; they are freed before the next simulator is built if their
+    owner is gone by then."""
+    if _current is not None and _current.device == "cpu" and (handle := place_fields()) is not None:
+        weakref.finalize(owner, _dropped.append, (_current, handle)).atexit = False
 
 
 def is_current(runtime: Runtime) -> bool:

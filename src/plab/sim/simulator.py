@@ -24,7 +24,7 @@ from plab.sim.compiler import ti
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
-from plab.sim.runtime import is_current, register_user, start_runtime
+from plab.sim.runtime import is_current, own_fields, register_user, start_runtime
 from plab.sim.state import (
     Measures,
     Rollout,
@@ -124,6 +124,7 @@ class Simulator:
         if impulses:
             self._engine.allocate_impulses()
         self._engine.attach(terms)
+        own_fields(self._engine)
         self.terms: tuple[LossTerm, ...] = tuple(term for term in self._engine.terms if term.weighted)
         self._engine.fill_parameters(self.scenes)
         register_user(self)

@@ -24,7 +24,7 @@ from plab.laws import Law
 from plab.laws.algebra import Series
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim.compiler import ti
-from plab.sim.runtime import Runtime
+from plab.sim.runtime import Runtime, own_fields
 from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.tensors import Array
 
@@ -236,6 +236,7 @@ class Storage:
         """Allocate the fields for gradients, once."""
         if not self.adjoint_sums:
             self._allocate_adjoint()
+            own_fields(self)
 
     def _allocate_adjoint(self) -> None:
         b = self.batch
