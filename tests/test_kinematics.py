@@ -18,6 +18,7 @@ import plab
 from plab.cli.main import main
 from plab.config import ConfigError, build_scene, load_config
 from plab.config.run import config_dict, config_hash
+from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS
 from plab.demonstrations import known_actions
 from plab.kinematics import Chain, read_model
 from plab.kinematics.actions import JointActions
@@ -203,6 +204,17 @@ def test_the_gradient_by_joint_actions(arm: Simulator) -> None:
     alone, both, given = JointActions(arm.scenes[1:]), JointActions(arm.scenes), actions.swapaxes(0, 1)
     twists = both.drive(both.start, given).twists[:, 1:]
     np.testing.assert_array_equal(alone.drive(alone.start, given[:, 1:]).twists, twists)
+
+
+@pytest.mark.parametrize("task", EXTENSION_TASKS)
+def test_every_extension_task_has_a_known_solution(task: str) -> None:
+    """Of five variants and of random ones; no two are the same."""
+    words = [[f"variant={v}"] for v in SUITE_VARIANTS] + [
+        ["variant=random", f"seed_scene={s}"] for s in (0, 1)
+    ]
+    known = [known_actions(load_config([f"task={task}", *one])) for one in words]
+    assert all(actions.shape[0] == 50 and 0 < np.abs(actions).max() <= 1 for actions in known)
+    assert len({actions.tobytes() for actions in known}) == len(words)
 
 
 COARSE = ("sim.grid_size=16", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.05")
