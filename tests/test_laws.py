@@ -1,6 +1,7 @@
 """Constitutive laws: formulas, closed forms, adjoints, compiled functions and their cache."""
 
 import ctypes
+import dataclasses
 import math
 import re
 import sys
@@ -9,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import laws
 from plab.config import build_scene, load_config
 from plab.laws import Law
-from plab.scenes import LAWS, Material, find_law
-from plab.sim import DeviceError
+from plab.scenes import LAWS, Body, Material, Scene, find_law
+from plab.sim import DeviceError, Simulator
 from plab.sim.codegen import bitcode
 from plab.sim.compiler import ti
 from plab.sim.cuda_sums import add
@@ -107,6 +109,67 @@ def test_separated_sand_carries_nothing_until_it_is_back_at_its_volume() -> None
         tau, f = sand.update(rate * np.eye(3).reshape(9), np.array(f), DT, *coefficients(sand))
         seen.append(tau[0])
     assert np.abs(seen[:4]).max() == 0.0 and seen[4] < -1.0
+
+
+def principal_stress(law: str, strain: np.ndarray, own: list[float]) -> np.ndarray:
+    """Principal Kirchhoff stresses after a substep from principal Hencky strains, in closed form."""
+    mu, lam, *more = own
+    trace, j = strain.sum(), math.exp(strain.sum())
+    if law == "elastic":
+        return mu * np.expm1(2.0 * strain) + lam * j * (j - 1.0)
+    deviator, norm = strain - trace / 3.0, np.linalg.norm(strain - trace / 3.0)
+    pressure = (lam + 2.0 * mu / 3.0) * trace
+    if law == "drucker_prager":
+        return 2.0 * mu * min(1.0, -1.5 * more[0] * pressure / mu / norm) * deviator + pressure
+    over = 2.0 * mu * norm - more[0]
+    carried = more[0] + over / (1.0 + mu * DT / more[1]) if over > 0.0 else 2.0 * mu * norm
+    return carried * deviator / norm + pressure
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.02])
+def test_blocks_carry_the_stress_of_closed_forms(size: float) -> None:
+    """In uniaxial compression and in simple shear under pressure, elastic and yielding.
+
+    The stress of a body is what a substep adds to the moment of its momentum.
+    """
+    names, grid, edge = ("elastic", "drucker_prager", "viscoplastic"), 32, 6
+    block = laws.lattice(edge, edge, edge) / grid
+    bodies = tuple(Body("box", (0.5,) * 3, (0.1,) * 3, len(block), law=name) for name in names)
+    scene = Scene("blocks", bodies, (), gravity=(0.0, 0.0, 0.0), grid_size=grid, dt=DT, substeps=1)
+    x = np.concatenate([np.add(block, [0.13 + 0.28 * k, 0.4, 0.4]) for k in range(3)])
+    sim = Simulator([scene] * 2, precision="float64", particles=[x] * 2)
+    f = np.tile(np.eye(3), (2, 1, 1))
+    f[0, 0, 0] = 1.0 - size
+    f[1] *= 0.999
+    f[1, 0, 1] = 0.999 * size
+    start = sim.state()
+    sim.set_state(dataclasses.replace(start, F=np.tile(f[:, None], (1, len(x), 1, 1))))
+    sim.step(np.zeros((2, 0)))
+    end, half = sim.state(), math.asinh(0.5 * size)
+    axes = np.eye(3)
+    turn = 0.5 * math.atan2(2.0, size)
+    axes[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+    strains = np.array([math.log(1.0 - size), 0.0, 0.0]), np.array([half, -half, 0.0]) + math.log(0.999)
+    for k, material in enumerate(scene.materials):
+        mine = scene.particle_bodies == k
+        own = material.kind.coefficients_of(material.values)
+        for e, (strain, frame) in enumerate(zip(strains, (np.eye(3), axes), strict=True)):
+            moment = (
+                end.v[e, mine].T @ start.x[e, mine] / mine.sum() + end.C[e, mine].mean(0) / (2 * grid) ** 2
+            )
+            wanted = frame @ np.diag(principal_stress(material.law, strain, own)) @ frame.T
+            np.testing.assert_allclose(-moment / DT, wanted, rtol=0, atol=1e-8 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(("case", "cells", "tolerance"), [("swirl", 8, 0.03), ("layer", 8, 0.03)])
+def test_fluids_have_their_viscosity_and_their_weight(case: str, cells: int, tolerance: float) -> None:
+    for what, value, wanted in laws.CASES[case][0](cells):
+        assert value == pytest.approx(wanted, abs=tolerance), what
+
+
+def test_a_bingham_body_rests_below_its_yield_stress_and_slumps_above() -> None:
+    rests, *slumps = [value for _what, value, _wanted in laws.slump(6)]
+    assert abs(rests) < 0.01 and 0.1 < slumps[0] < slumps[1] - 0.1 < 0.4
 
 
 # ----------------------------------------------------------------------------------------------- adjoints

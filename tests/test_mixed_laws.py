@@ -83,8 +83,9 @@ def test_states_and_gradients_are_those_of_the_reference(simulator: Simulator, c
         assert np.abs(a[0] - b.numpy()).max() < 1e-7 * b.abs().max().item()
 
 
-def test_each_parameter_has_the_gradient_of_central_differences(simulator: Simulator) -> None:
-    simulator.set_contact("soft")
+@pytest.mark.parametrize("contact", ["soft", "hard"])
+def test_each_parameter_has_the_gradient_of_central_differences(simulator: Simulator, contact: str) -> None:
+    simulator.set_contact(contact)
     scene = simulator.scenes[0]
     actions = np.random.default_rng(7).uniform(-0.9, 0.9, (1, 2, scene.action_dim))
     simulator.rollout(actions)

@@ -14,8 +14,11 @@ from plab.errors import ConfigError
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 
-EXTENSION_TASKS = ("Gripper", "HandFold", "HandLift", "HandPinch", "HandPress", "HandRoll")
-"""Extension tasks with articulated models, not included in tables and defaults of the suite."""
+EXTENSION_TASKS = (
+    *("Gripper", "HandFold", "HandLift", "HandPinch", "HandPress", "HandRoll"),
+    *("Pour", "SandHeap"),
+)
+"""Extension tasks: articulated models, sand and fluid; not included in tables and defaults of the suite."""
 
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
 """Methods that the paper compares, in its order."""
