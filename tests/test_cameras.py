@@ -128,16 +128,6 @@ def test_environments_observe_by_key():
             plab.make("Move", overrides=COARSE, **wrong)
 
 
-def test_stable_baselines_learns_from_pictures():
-    from stable_baselines3 import PPO
-
-    from plab.envs.sb3 import make_sb3
-
-    envs = make_sb3("plab/Move-v1", 2, overrides=COARSE, observe=["state", "rgb"])
-    model = PPO("MultiInputPolicy", envs, n_steps=4, batch_size=8, n_epochs=1).learn(16)
-    assert model.num_timesteps == 16 and set(envs.observation_space) == {"state", "front_rgb"}
-
-
 def test_tensors_by_key_stay_on_the_device():
     import torch
 

@@ -156,8 +156,15 @@ def test_goals_agree_with_hindsight() -> None:
 
 def test_wrappers_of_environments(alone) -> None:
     env, picture = alone[0], plab.make("Move", overrides=COARSE, **PICTURES)
-    size = env.observation_space.shape[0]
+    colours, size = plab.make("Move", overrides=COARSE, observe="rgb"), env.observation_space.shape[0]
     wrapped = [
+        single.AddWhiteNoise(colours, 0.1),
+        single.GrayscaleObservation(colours),
+        single.ObstructView(colours, 0.1, 5),
+        single.OrderEnforcing(env.unwrapped),
+        single.PassiveEnvChecker(env.unwrapped),
+        single.DiscretizeAction(env, 3),
+        single.RepeatAction(env, 2),
         single.DelayObservation(env, 1),
         single.DtypeObservation(env, np.float64),
         single.FrameStackObservation(env, 2),
@@ -186,6 +193,7 @@ def test_wrappers_of_environments(alone) -> None:
         while not (result := one.step(one.action_space.sample()))[3]:
             assert one.observation_space.contains(result[0]), one
     picture.close()
+    colours.close()
 
 
 def test_wrappers_of_vector_environments(vector) -> None:
@@ -200,6 +208,7 @@ def test_wrappers_of_vector_environments(vector) -> None:
         many.TransformReward(env, abs),
         many.RecordEpisodeStatistics(env),
         many.DictInfoToList(env),
+        many.VectorizeTransformReward(env, single.TransformReward, func=abs),
     ]
     # Gymnasium refuses the others in the other modes.
     if mode != AutoresetMode.SAME_STEP:
@@ -208,9 +217,12 @@ def test_wrappers_of_vector_environments(vector) -> None:
             many.FlattenObservation(env),
             many.RescaleObservation(env, np.float32(-1), np.float32(1)),
             many.TransformObservation(env, np.copy, env.observation_space),
+            many.ReshapeObservation(env, (2, env.single_observation_space.shape[0] // 2)),
         ]
     if mode == AutoresetMode.NEXT_STEP:
         wrapped.append(many.NormalizeObservation(env))
+        space = {"func": np.copy, "observation_space": env.single_observation_space}
+        wrapped.append(many.VectorizeTransformObservation(env, single.TransformObservation, **space))
     for one in wrapped:
         observation, _ = one.reset(seed=0)
         for _ in range(HORIZON + (mode != AutoresetMode.DISABLED)):
