@@ -53,7 +53,7 @@ class Networks:
         return [tensor for part in parts or self.parts for tensor in self.parts[part].values()]
 
     def write_to(self, policy: nn.Module, agent: int) -> None:
-        """Give a policy the parameters of an agent."""
+        """Copy the parameters of an agent to a policy."""
         own = dict(policy.named_parameters())
         with torch.no_grad():
             for part, modules in self._modules.items():

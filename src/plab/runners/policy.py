@@ -172,7 +172,7 @@ def save_policy(
         result: The run's result file.
         method: The section ``method`` of its configuration.
         policy: Stable-Baselines3's policy.
-        moments: Those by which the observations were scaled, if they were.
+        moments: Moments that scale the observations, if any.
 
     Raises:
         ResultsError: If the file cannot be written.

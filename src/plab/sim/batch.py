@@ -98,7 +98,7 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
 
 
 def material_keys(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the parameters of a scene's laws, in the order in which gradients have them."""
+    """Return the names of the parameters of a scene's laws, in the order of gradients."""
     return tuple(dict.fromkeys(key for law in scene.laws for key in find_law(law).keys))
 
 

@@ -85,11 +85,11 @@ class CameraSensor:
         """Take pictures of the current states.
 
         Args:
-            names: Of ``depth``, ``segmentation`` and ``rgb``; all if none is given.
+            names: Out of ``depth``, ``segmentation`` and ``rgb``; default: all.
             like: Given a CUDA tensor, pictures are CUDA tensors and stay on the device.
 
         Returns:
-            ``depth``: along the optical axis [domain units], ``camera.far`` where nothing is, shape [batch,
+            ``depth``: along the optical axis [domain units], ``camera.far`` for the background, shape [batch,
             height, width], float32. ``segmentation``: labels, see :data:`BACKGROUND`, same shape, int32.
             ``rgb``: shape [batch, height, width, 3], uint8.
         """
@@ -137,7 +137,7 @@ class CameraSensor:
 
     @ti.func
     def key(self, depth, label):
-        """Depth and label as an integer that grows with the depth, which is positive."""
+        """Encode positive depth and label as an integer, ordered by depth."""
         return (ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64) << 32) | ti.cast(label, ti.i64)
 
     @ti.func
@@ -152,7 +152,7 @@ class CameraSensor:
 
     @ti.func
     def ray(self, frame: ti.template(), row, column, focal):
-        """Direction of a pixel's ray, along which depth is the parameter."""
+        """Direction of a pixel's ray, parametrised by depth."""
         right = (ti.cast(column, ti.f32) + 0.5 - 0.5 * self.width) / focal
         up = (0.5 * self.height - ti.cast(row, ti.f32) - 0.5) / focal
         return right * self.axis(frame, 1) + up * self.axis(frame, 2) - self.axis(frame, 3)

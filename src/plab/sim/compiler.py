@@ -1,9 +1,9 @@
 """Compiler of the kernels: Taichi, or Quadrants, its fork with wheels for Python 3.14, and patches of both.
 
 Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025) and
-Quadrants 1.3.3; pyproject.toml has the versions that are allowed. Each function documents its changes and
-their reason. The standard library is not changed. :mod:`plab.sim` imports this module before any kernel is
-defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
+Quadrants 1.3.3; pyproject.toml lists the supported versions. Each function documents its changes and their
+reason. The standard library is not changed. :mod:`plab.sim` imports this module before any kernel is defined,
+as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ MIN_TASK_SIZE = 512
 the work of a thread."""
 
 PADDING = 32
-"""Distance of the teams' barrier counters, so that no two share a cache line."""
+"""Stride between the barrier counters of teams, to avoid sharing cache lines."""
 
 PROBE_FIRST, PROBE = 16, 100
 """Launches after which the slower team is timed again: first interval, doubled each time, and largest
@@ -62,7 +62,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def add_impulse(self, row, m, value):
-        """Add to a chunk's share of an impulse, which one thread owns."""
+        """Add to a chunk's part of an impulse, owned by one thread."""
         self.impulse_part[row, m] = self.impulse_part[row, m] + ti.cast(value, ti.f64)
 
     @ti.func
@@ -86,8 +86,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def first_entry(self, e, c):
-        """First entry of a chunk's share of the environment's block list: the blocks that no earlier chunk
-        holds."""
+        """First entry of a chunk's part of the environment's block list: blocks not touched by earlier
+        chunks."""
         return e * self.blocks + self.block_first[e, c]
 
     # -- phases of one chunk ------------------------------------------------------------------------
@@ -135,7 +135,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def grid_chunk(self, e, c, s):
-        """Grid update of a share of the environment's blocks; the private grids are cleared for the next
+        """Grid update of a part of the environment's blocks; the private grids are cleared for the next
         substep."""
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
@@ -150,7 +150,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def take(self, grid: ti.template(), e, node, holders):
-        """Sum a node over the private grids of the chunks that hold it, and clear it there."""
+        """Sum a node over the private grids of the chunks that touch it, and clear it there."""
         total = ti.Vector.zero(self.real, 4)
         for c in range(self.chunks):
             if holders & (1 << c) != 0:
@@ -296,7 +296,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def node_terms_chunk(self, e, c):
-        """Sum the terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
+        """Sum the terms of a part of the blocks, and write mass and the slope of the loss to the nodes."""
         part = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         last = ti.static(len(self.node_terms))
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
@@ -456,8 +456,8 @@ class CpuEngine(CpuPhases):
     def loss_gradient_of_team(
         self, state: ti.template(), slot, bar: ti.template(), e, team, rank, size, contact
     ):
-        """Add the gradient of one environment's loss to the adjoints of its particles and poses; to those of
-        the poses alone without ``contact``."""
+        """Add the gradient of one environment's loss to the adjoints of its particles and poses; only to
+        those of the poses without ``contact``."""
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
             if contact:
                 self.particle_gradient_chunk(state, slot, bar, e, c)

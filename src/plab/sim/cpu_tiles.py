@@ -3,7 +3,7 @@
 LLVM vectorises loops that begin with loads from a field or end with stores to one. A transfer therefore first
 writes the stencil data of a tile to ``stencils`` (lane vectors, one particle per lane), and then sums over
 the nodes of each particle. These sums and the laws are LLVM bitcode (:mod:`plab.sim.codegen`), because
-Taichi's code for them is slow. Each part of von Mises plasticity takes its input from ``strains`` and leaves
+Taichi's code for them is slow. Each part of von Mises plasticity reads its input from ``strains`` and writes
 its results there.
 
 ``at`` and ``bases_at`` are the first entries of a thread's shares of ``stencils`` and ``bases``; ``source``,
@@ -79,14 +79,14 @@ class TilePhases(ParticlePhases):
 
     def _allocate(self) -> None:
         grids = self.batch * self.chunks
-        # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
+        # First of all fields, otherwise the gradient's kernel has 1 % more instructions for addresses.
         self.stencils = ti.Vector.field(self.lanes, self.real, shape=grids * STENCILS)
         self.bases = ti.Vector.field(self.lanes, ti.i32, shape=grids * BASES)
         self.strains = ti.Vector.field(self.lanes, self.real, shape=grids * STRAINS)
         super()._allocate()
         if len(self.laws) > 1:
             self.tile_laws = self.share(ti.field(ti.i32, shape=self.batch * self.tiles))
-        # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
+        # Start of each chunk's part of an environment's block list, and the chunks that touch each block.
         self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
         self.block_chunks = ti.field(ti.i32, shape=self.batch * self.blocks)
         # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
@@ -241,7 +241,7 @@ class TilePhases(ParticlePhases):
     # -- material -----------------------------------------------------------------------------------
 
     def fill_laws(self, scenes: Sequence[Scene]) -> None:
-        """Write a bit mask of each tile's laws, where there are several."""
+        """Write a bit mask of each tile's laws if there are several."""
         if len(self.laws) > 1:
             numbers = np.array([[self.laws.index(m.kind) for m in s.materials] for s in scenes])
             own = numbers[np.arange(self.batch).reshape(-1, 1, 1, 1), self._bodies]
@@ -257,7 +257,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def put_parameters(self, e, entry9, at, first: ti.template(), count: ti.template()):
-        """Write a tile's coefficients into ``strains``, and of several laws the number of each lane's."""
+        """Write a tile's coefficients to ``strains`` and, with several laws, the number of each lane's
+        law."""
         p = self.parameters_of_tile(e, entry9)
         for i in ti.static(range(count)):
             self.strains[at + first + i] = p[i]

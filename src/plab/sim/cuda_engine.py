@@ -1,11 +1,11 @@
-"""Engine of CUDA, its kernels: one thread per particle, per node of an active block, per pose.
+"""CUDA engine and its kernels: one thread per particle, per node of an active block, per pose.
 
-A substep is one launch from Python of a kernel with several parallel loops, because a launch costs 13 to 17
-microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device:
-the number of active blocks is only known on the device, so loops over nodes have a fixed number of threads.
+A substep is one launch from Python of a kernel with several parallel loops, because each launch costs 13 to
+17 microseconds and each loop only a few. The host never waits for the device: the number of active blocks is
+only known on the device, so loops over nodes have a fixed number of threads.
 
-Sums over particles at a node are atomic, in whatever order the device runs them: results differ between
-runs by rounding, unless the simulator is deterministic (:mod:`plab.sim.cuda_sums`).
+Sums over particles at a node are atomic, with an arbitrary order of additions, so results differ between runs
+by rounding unless the simulator is deterministic (:mod:`plab.sim.cuda_sums`).
 """
 
 import ctypes
@@ -19,7 +19,7 @@ from plab.sim.storage import STATE
 from plab.sim.tensors import Array
 
 THREADS_MAX = 1 << 17
-"""Threads of a loop over nodes: about as many as the largest devices hold at a time."""
+"""Number of threads of a loop over nodes, about the number of resident threads of the largest devices."""
 
 RESIDENT_BLOCKS = 2
 """Maximum number of blocks per multiprocessor in the single-launch step."""
@@ -31,7 +31,7 @@ MAX_TILE_WARPS = 4
 """Maximum number of warps per tile in the single-launch step."""
 
 RESERVED = 1024
-"""Bytes of shared memory that a device takes for itself from each block."""
+"""Shared memory reserved by the device per block [bytes]."""
 
 MULTIPROCESSORS, SHARED_BYTES = 16, 81
 """The driver's numbers for how many multiprocessors there are, and for the shared memory of each [bytes]."""
@@ -115,11 +115,11 @@ class CudaEngine(CudaPhases):
         self, state, bar, poses, actions, actions_bar, terms, at, slot, t, stamp, contact
     ) -> None:
         """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and of its
-        loss, with the measures that it is made of written to ``terms`` from entry ``at``.
+        loss, with its measures written to ``terms`` from entry ``at``.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
-        likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does not matter and
-        does not hold the adjoint.
+        likewise. If there was no ``contact`` up to the end of this step, ``bar`` is not needed and does not
+        contain the adjoint.
         """
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
@@ -195,8 +195,8 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def losses(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
-        """Measures of all environments, written to ``terms`` from entry ``at``; leaves mass and the loss's
-        slope at the nodes of active blocks."""
+        """Write the measures of all environments to ``terms`` from entry ``at``, and mass and the slope of
+        the loss to the nodes of active blocks."""
         for q in range(self.part_threads):
             e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, self.parts)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
@@ -262,8 +262,7 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
-        """Adjoints of all substeps of an environment step in one launch, as :meth:`resident_step_kernel` runs
-        them."""
+        """Adjoints of all substeps of an environment step in one launch, as :meth:`resident_step_kernel`."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
             for back in range(self.substeps):

@@ -73,7 +73,7 @@ class CudaPhases(OrderPhases, PosePhases):
         threads = self.batch * self.tiles * self.lanes
         moving = self.distance_terms and any(self.moves(shape) for shape in self.shapes)
         self.measure_sums = self.sums(self.batch * max(1, len(self.node_terms) + len(self.particle_terms)))
-        # Distances of all particles, written and tallied once per loss; static manipulators leave theirs out.
+        # Distances of all particles from moving manipulators, computed once per loss.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
 
     def _allocate_adjoint(self) -> None:
@@ -311,7 +311,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def accumulate_material(self, row, bars: ti.template()):
-        """Add to a material's adjoint, which all threads of an environment share."""
+        """Add to a material's adjoint, shared by all threads of an environment."""
         for i in ti.static(range(len(bars))):
             self.add_up(self.material_sums, row * self.coefficients + i, ti.cast(bars[i], ti.f64))
 
@@ -391,7 +391,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def take_measures(self, e):
-        """Take an environment's sums over nodes and particles to where they are joined."""
+        """Move an environment's sums over nodes and particles to the joint measures."""
         nodes, particles = ti.static(len(self.node_terms), len(self.particle_terms))
         for k in ti.static(range(nodes)):
             self.node_part[e, 0][k] = self.take_sum(self.measure_sums, e * (nodes + particles) + k)
@@ -443,8 +443,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def own_particle(self, q, parts: ti.template()):
-        """Environment and number of the particle of thread q, where ``parts`` warps share a tile's particles,
-        neighbours to each; and whether the thread has one."""
+        """Environment and number of the particle of thread q if ``parts`` warps share the particles of a tile
+        in contiguous parts; and whether the thread has one."""
         share = ti.static((WARP + parts - 1) // parts)
         unit, place = q // WARP, q % WARP + q // WARP % parts * share
         e, particle = self.particle_of(unit // parts * WARP + ti.min(place, WARP - 1))
@@ -452,11 +452,11 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def sorted_particle(self, state: ti.template(), slot, q, parts: ti.template()):
-        """The particle that thread q takes of its warp's share of a tile, see :meth:`own_particle`, in the
-        order of their base nodes; all lanes of a warp take part.
+        """Particle of thread q when its warp's part of a tile, see :meth:`own_particle`, is sorted by base
+        node; all lanes of a warp must take part.
 
         Returns environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and
-        the base node's grid index, which is negative, and another for each, where there is no particle.
+        the base node's grid index, or a distinct negative index without a particle.
         """
         e, particle, own = self.own_particle(q, parts)
         tile = particle // self.lanes
@@ -476,7 +476,8 @@ class CudaPhases(OrderPhases, PosePhases):
         at = w % RESIDENT_BLOCK
         first = ((threads - w + at) // RESIDENT_BLOCK - 1) * POSE_SHARE
         count = ti.min(self.pose_threads - first, POSE_SHARE)
-        # Neighbouring threads take the same manipulator of different environments, hence the same path.
+        # Neighbouring threads process the same manipulator of different environments, and therefore the same
+        # branch.
         e, m = (first + at) % self.batch, (first + at) // self.batch
         for _shape, start, stop in ti.static(self.shape_ranges):
             if at < count and start <= m < stop:
@@ -660,7 +661,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def node_terms_thread(self, w, q):
-        """Terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
+        """Compute the terms of node q of the active blocks in thread w, and write mass and the slope of the
+        loss to the node."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         unit = self.momentum_scale(-1)
@@ -684,8 +686,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def distance_gradient_thread(self, state: ti.template(), slot, bar: ti.template(), q):
-        """Add the gradient of terms that look at all particles' distances to the adjoint of thread q's
-        particle, and to the poses'; all lanes of a warp take part."""
+        """Add the gradient of distance terms over all particles to the adjoints of thread q's particle and of
+        the poses; all lanes of a warp must take part."""
         e, particle = self.particle_of(q)
         tile = particle // self.lanes
         lane = particle & (self.lanes - 1)

@@ -38,7 +38,7 @@ LARGEST_TERM = 2.0**72
 """Terms of a sum above this value count as infinite."""
 
 NOT_FINITE = 0x7F800000
-"""Bits of a float32 from which on it is infinite or NaN, its sign left out."""
+"""Bits of a float32, without sign, at and above which it is infinite or NaN."""
 
 LEAST_EXPONENT = -80
 """Adjoints below 2^-80 use the units of 2^-80."""
@@ -180,7 +180,7 @@ class SumPhases(Storage):
 
     @ti.func
     def momentum_scale(self, power: ti.template()):
-        """Units of momentum (3) and mass that make 1, or for ``power`` -1 the inverse, 4-vector."""
+        """Number of units of momentum (3) and mass per 1, or for ``power`` -1 the inverse, 4-vector."""
         exponent = ti.static(-math.floor(math.log2(self.mass)))
         momentum = ti.cast(ti.static(2.0 ** (power * (MOMENTUM_BITS + exponent))), self.real)
         mass = ti.cast(ti.static(2.0 ** (power * (MASS_BITS + exponent))), self.real)
@@ -188,8 +188,8 @@ class SumPhases(Storage):
 
     @ti.func
     def adjoint_scale(self, e, power: ti.template()):
-        """Units of a node's adjoint that make 1 in an environment, or for ``power`` -1 the inverse, 4-vector
-        of one number; the inverse is not finite where an adjoint is not."""
+        """Number of units of a node's adjoint per 1 in an environment, or for ``power`` -1 the inverse, as a
+        constant 4-vector; the inverse is non-finite if an adjoint is."""
         number = ti.cast(1.0, ti.f32)
         if ti.static(self.deterministic):
             bits = self.adjoint_bound[e]
@@ -210,6 +210,6 @@ class SumPhases(Storage):
 
     @ti.func
     def bits_of(self, bound):
-        """Return the bits of a nonnegative float32: they have the order of the numbers, with infinity and NaN
-        above all."""
+        """Return the bits of a nonnegative float32: their order is that of the numbers, followed by infinity
+        and NaN."""
         return ti.bit_cast(ti.cast(bound, ti.f32), ti.i32) & 0x7FFFFFFF

@@ -18,7 +18,7 @@ from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 
 ALL_LANES = 0xFFFFFFFF
-"""Mask of a warp: 32 threads, which are the 32 lanes of one tile of particles."""
+"""Mask of a warp of 32 threads, corresponding to the 32 lanes of a tile of particles."""
 
 WARP = 32
 """Threads of a warp."""
@@ -114,7 +114,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def nodes_in(self, counter: ti.template()):
-        """Nodes of the blocks of all environments that ``counter`` has counted."""
+        """Number of nodes of the blocks counted in ``counter``, over all environments."""
         return counter[0] << NODE_BITS
 
     @ti.func
@@ -139,8 +139,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     @ti.func
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
         """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
-        of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32.
-        ``unit`` has the units of the components, see :meth:`add_to_grid`."""
+        of shared memory; the numbers ``r`` of the warp's nodes in the block are consecutive from a multiple
+        of 32. ``unit`` has the units of the components, see :meth:`add_to_grid`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         # Read all before writing, so that the device waits once instead of four times.
@@ -186,7 +186,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def wide_from_above(self, value, offset):
-        """The float64 that the lane ``offset`` above this one holds."""
+        """The float64 of the lane ``offset`` above this one."""
         bits = ti.bit_cast(value, ti.i64)
         low = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), offset)
         high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
@@ -228,8 +228,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def run_heads(self, key, taking_part, lane):
-        """The runs of neighbouring lanes with the same key in a warp. Of a run all lanes take part or none,
-        and those that do are the warp's first.
+        """The runs of neighbouring lanes with the same key in a warp. Either all lanes of a run take part or
+        none, and participating lanes come first.
 
         Returns whether this is the first lane of a run that takes part, a bit for each lane that is, and how
         many lanes take part.
@@ -242,7 +242,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def lowest_bit(self, bits):
-        """Number of the lowest bit that is set; at least one is."""
+        """Index of the lowest set bit of a nonzero number."""
         return 31 - ti.math.clz(ti.cast(bits & (~bits + 1), ti.i32))
 
     @ti.func
@@ -386,7 +386,7 @@ class OrderPhases(WarpPhases):
 
     @ti.func
     def begin_shares(self, e, node, lane):
-        """Turn the counts of a warp's cells into the places where their shares begin."""
+        """Convert the counts of a warp's cells to offsets."""
         count = self.cell_count[node]
         upto = count
         for k in ti.static(range(RUN_BITS)):
@@ -413,10 +413,10 @@ class OrderPhases(WarpPhases):
         t: ti.i32,
         stamp: ti.i32,
     ):
-        """Put the particles of a time slot into the order of their cells, in another slot or array.
+        """Sort the particles of a time slot by cell, into another slot or array.
 
-        The move is written as that of step t, and which given particle is where after it to ``after``, from
-        which was where before it, ``numbers``.
+        The permutation is written for step t, and the resulting particle order to ``after``, from the
+        previous order ``numbers``.
         """
         for e in range(self.batch):
             self.placed[e] = 0
@@ -473,13 +473,13 @@ class OrderPhases(WarpPhases):
     def move(
         self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32, moves: Array, t: ti.i32
     ):
-        """Put the states of a time slot into the order of step t, in another slot or array."""
+        """Permute the states of a time slot to the order of step t, into another slot or array."""
         for q in range(self.particle_threads):
             self.move_particle(source, source_slot, target, target_slot, moves, t, q)
 
     @ti.kernel
     def move_back(self, source: Array, target: Array, moves: Array, t: ti.i32):
-        """Put adjoints from the order of step t into the one before it, in another array."""
+        """Permute adjoints from the order of step t to the previous one, into another array."""
         for q in range(self.particle_threads):
             e, place = self.particle_of(q)
             origin = moves[t * self.particle_threads + q]

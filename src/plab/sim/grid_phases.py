@@ -94,7 +94,7 @@ class GridPhases(Storage):
     def near_manipulators(self, e, s, block):
         """Bit mask of the manipulators that can reach a node of a block in substep s.
 
-        Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
+        Distances are 1-Lipschitz, so one evaluation at the block's centre covers all of its nodes.
         """
         mask = 0
         for shape, start, stop in ti.static(self.shape_ranges):
@@ -308,7 +308,7 @@ class GridPhases(Storage):
 
     @ti.func
     def after_manipulators(self, e, s, x, v, near, count):
-        """Velocity of a node after contact with the first ``count`` manipulators, where they are near."""
+        """Velocity of a node after contact with those of the first ``count`` manipulators that are near."""
         out = v
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, ti.min(stop, count)):

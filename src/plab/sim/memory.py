@@ -34,7 +34,7 @@ def environment_bytes(
         scene: The scene.
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
-        states: Particle states that are kept.
+        states: Number of stored particle states.
         gradient: Whether to include adjoints of the grids.
     """
     places = -(-scene.particle_count // LANES[device]) * LANES[device]
@@ -112,7 +112,8 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
         # No array is longer than one step; one array stores the starts of segments.
         lengths = range(-(-scene.horizon // (slots_per_step + 1)), scene.horizon + 1)
         kept = min(kept_states(scene.horizon, slots_per_step, length, 1) for length in lengths)
-    # The current and the initial state, their adjoints, orders, and room to sort: less than seven states.
+    # The current and the initial state, their adjoints, orders, and buffers for sorting: less than seven
+    # states.
     one = environment_bytes(scene, precision, device, states=kept + 7, gradient=True)
     entries = -(-scene.particle_count // LANES[device]) * LANES[device] * STATE
     numbered = (

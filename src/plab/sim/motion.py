@@ -110,7 +110,7 @@ def rotation_matrix_adjoint(q, m):
 
 @ti.func
 def roll_factors(u):
-    """World yaw by -u[1] about y and own roll by u[0] about y, as quaternions."""
+    """World yaw by -u[1] about y and local roll by u[0] about y, as quaternions."""
     return quat_from_rotvec(vec3(0.0, -u[1], 0.0)), quat_from_rotvec(vec3(0.0, u[0], 0.0))
 
 
@@ -128,8 +128,8 @@ def displacement(motion: ti.template(), pose, u):
 
 @ti.func
 def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
-    """Pose (8) after one substep, by this substep's share u (7) of the clipped and scaled action; ``motion``
-    is a rule of :class:`plab.scenes.ManipulatorShape`."""
+    """Pose (8) after one substep with motion u (7), the clipped and scaled action divided by the number of
+    substeps; ``motion`` is a rule of :class:`plab.scenes.ManipulatorShape`."""
     out = pose
     if ti.static(motion != "static"):
         move = displacement(motion, pose, u)
@@ -243,7 +243,8 @@ class PosePhases(Storage):
 
     @ti.func
     def substep_motion(self, e, start: ti.template(), m, actions: ti.template(), t):
-        """One substep's share of the action of manipulator m, clipped and scaled where its shape asks so."""
+        """Motion of manipulator m per substep, from its action, clipped and scaled if required by the
+        shape."""
         u = vec7(0.0)
         entry = self.action_of(e, start, m, t)
         for i in ti.static(range(self.action_dims[start])):
@@ -331,7 +332,8 @@ class PosePhases(Storage):
 
     @ti.func
     def frame_shares(self, e, start: ti.template(), m, s, frame):
-        """Return a frame's share in the adjoints of the poses at the end and the start of substep s."""
+        """Return the contributions of a frame to the adjoints of the poses at the end and the start of
+        substep s."""
         inv_dt = ti.cast(1.0, ti.f64) / self.dt
         end_bar = vec8(0.0)
         start_bar = vec8(0.0)

@@ -1,4 +1,4 @@
-"""Particle phases of a substep that both devices share: state access, stencils, material by singular values.
+"""Particle phases of a substep common to both devices: state access, stencils, material by singular values.
 
 Transfers between a particle and its 27 grid nodes use quadratic B-splines and fields that are affine around
 the particle (APIC, moving least squares). Such a field is a 4-vector at the base node and three increments,
@@ -209,8 +209,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def parameters_of_tile(self, e: ti.template(), entry9: ti.template()):
-        """Coefficients of a tile's particles, which are numbers, or lanes where bodies differ, and there of
-        several laws the number of each; ``entry9`` is the tile's in ``affine``."""
+        """Coefficients of a tile's particles, as numbers, or as lanes if bodies differ, with law numbers if
+        there are several; ``entry9`` is the tile's in ``affine``."""
         if ti.static(self.mixed):
             first = entry9 // 9 * ti.static(self.place_rows)
             return [self.place_material[first + i] for i in range(self.place_rows)]
@@ -219,7 +219,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def parameters_of_particle(self, e: ti.template(), entry: ti.template(), lane: ti.template()):
-        """The same of one particle; ``entry`` is its tile's, of any time slot."""
+        """As :meth:`parameters_of_tile`, for one particle; ``entry`` is its tile's, of any time slot."""
         if ti.static(self.mixed):
             first = self.place_of(entry) * ti.static(self.place_rows)
             return [self.place_material[first + i][lane] for i in range(self.place_rows)]
@@ -234,7 +234,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def accumulate_particle(self, grid_index, entry, lane, bars: ti.template()):
-        """Add one particle's share to the adjoint of its body's material."""
+        """Add one particle's contribution to the adjoint of its body's material."""
         body = self.place_body[self.place_of(entry)][lane]
         self.accumulate_material(grid_index * self.materials + body, bars)
 
@@ -290,13 +290,13 @@ class ParticlePhases(Storage):
 
     @ti.func
     def block_along(self, base):
-        """Block of a base node along an axis, and 1 where its stencil reaches into the next, else 0."""
+        """Block of a base node along an axis, and 1 if its stencil reaches the next block, otherwise 0."""
         return base >> BLOCK_BITS, ((base & (BLOCK - 1)) + 2) >> BLOCK_BITS
 
     @ti.func
     def block_of(self, base):
-        """Linear index of the block of a base node, and which axes its stencil crosses into the next block
-        (3 bits)."""
+        """Linear index of the block of a base node, and the axes along which its stencil reaches the next
+        block (3 bits)."""
         b, crosses = self.block_along(base)
         block = (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2]
         return block, crosses[0] + 2 * crosses[1] + 4 * crosses[2]

@@ -77,12 +77,12 @@ def curve_order(x: np.ndarray, n: int) -> np.ndarray:
 
 
 class ParticleOrder:
-    """Indices of the given particles by their places in the tiles.
+    """Particle numbers by place in the tiles.
 
     Attributes:
         initial: The order after :meth:`reset`, shape [batch, particle].
-        numbers: Numbers of the given particles on the device, by place; those at and beyond the number of
-            particles are padding, shape [batch * place].
+        numbers: Particle numbers on the device, by place, shape [batch * place]; numbers at or above the
+            number of particles are padding.
     """
 
     def __init__(self, engine: Any) -> None:
@@ -182,12 +182,12 @@ class Particles:
 
     @property
     def slot_entries(self) -> int:
-        """Numbers in one state of all environments."""
+        """Number of entries in one state of all environments."""
         return self.engine.batch * self.engine.tiles * STATE * self.engine.lanes
 
     @property
     def slot_bytes(self) -> int:
-        """Bytes of one state of all environments."""
+        """Size of one state of all environments [bytes]."""
         return self.slot_entries * np.dtype(self._numpy_real).itemsize
 
     def new_stamps(self, count: int) -> int:

@@ -60,7 +60,7 @@ class Runtime:
         device: ``cpu`` or ``cuda``.
         precision: ``float32`` or ``float64``, the type of particles and grid.
         threads: CPU threads; 1 on CUDA.
-        generation: Counts initialisations; a simulator of an older generation has lost its memory.
+        generation: Number of initialisations; simulators of older generations are invalid.
     """
 
     device: str
@@ -139,7 +139,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
         )
     _users.clear()
-    # Taichi announces the device on standard output, which belongs to the caller.
+    # Taichi prints the device to standard output, which is reserved for the caller.
     with contextlib.redirect_stdout(io.StringIO()):
         remove_stale_cache_lock()
         _start_taichi(device, precision, wanted)
@@ -183,7 +183,8 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         # asserts.
         advanced_optimization=False,
         offline_cache=True,
-        # The suite's kernels need more than Taichi's own 100 MB, and would be removed and compiled in turns.
+        # The suite's kernels exceed Taichi's default of 100 MB, and would be evicted and recompiled
+        # repeatedly.
         offline_cache_max_size_of_files=CACHE_BYTES,
         # Suppress warnings about a cache in use by another process; kernels are then not cached.
         log_level=ti.ERROR,

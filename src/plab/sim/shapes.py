@@ -1,7 +1,7 @@
 """Signed distances of manipulators in their own frames, with normals and Hessian products.
 
 :data:`SURFACES` has the functions of each shape of :data:`plab.scenes.MANIPULATOR_SHAPES`. All distances are
-exact, so the normal, their gradient, has length 1, and the broad phase may rely on it.
+exact, so normals have length 1, as required by the broad phase.
 """
 
 from collections.abc import Callable, Iterable
@@ -91,7 +91,7 @@ def capsule_hessian_product(p, size, _gap, w):
 
 @ti.func
 def nearer_stick(p):
-    """Sign of the own x offset of the chopstick nearer to p."""
+    """Sign of the local x offset of the chopstick nearer to p."""
     return ti.select(p[0] < 0.0, -1.0, 1.0)
 
 
@@ -104,7 +104,8 @@ def stick_point(p, size, gap):
 
 @ti.func
 def chopsticks_distance(p, size, gap):
-    """Two capsules along own -y, of length size[0] and radius size[1], their axes a gap apart."""
+    """Two capsules along local -y, with length size[0], radius size[1] and axes at the distance of the
+    gap."""
     return ball(stick_point(p, size, gap), size[1])
 
 
@@ -249,7 +250,7 @@ SURFACES |= {name: SURFACES[kind.outline] for name, kind in MANIPULATOR_SHAPES.i
 
 
 def require_surfaces(shapes: Iterable[str]) -> None:
-    """Raise SceneError if a shape lacks a surface, or a gripping one the slope of its gap."""
+    """Raise SceneError if a shape has no surface, or a gripper has no derivative with respect to its gap."""
     for shape in shapes:
         surface = SURFACES.get(shape)
         if surface is None or (MANIPULATOR_SHAPES[shape].grips and surface.gap_slope is None):

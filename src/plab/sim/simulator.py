@@ -60,7 +60,7 @@ class Simulator:
         batch: Number of environments.
         terms: Terms of the loss, in the order of :attr:`Measures.terms`.
         particle_count: Particles per environment.
-        manipulator_count: Manipulators per environment, static ones included.
+        manipulator_count: Manipulators per environment, including static ones.
         action_dim: Action components per environment step.
         grid_size: Grid nodes per axis.
         substeps: Substeps per environment step.
@@ -321,7 +321,7 @@ class Simulator:
         self._checked = True
 
     def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
-        """Advance all environments by one environment step, without keeping history.
+        """Advance all environments by one environment step, without storing history.
 
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. CUDA tensors stay on the device.

@@ -1,10 +1,10 @@
 """The material update by singular values, for strains outside the range of the series in
 :mod:`plab.laws.von_mises`.
 
-Reached by few particles (strong compression, inverted or nearly singular F, stiff materials that do not
-yield), so it is written for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the
-smallest singular value carries the sign of det F) and a derivative in divided differences with their limits.
-Material parameters are called as there, matrices are 3x3.
+Used for few particles (strong compression, inverted or nearly singular F, stiff materials that do not yield)
+and designed for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the smallest
+singular value carries the sign of det F) and a derivative in divided differences with their limits. Material
+parameters are called as there, matrices are 3x3.
 """
 
 from plab.laws.von_mises import NORM_SHIFT
@@ -14,8 +14,8 @@ SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
 
 
-# Taichi's own products of matrices take it several times as long to compile; those of plab.laws.algebra are
-# no functions of Taichi's.
+# Taichi's matrix products take several times as long to compile, and those of plab.laws.algebra are not
+# Taichi functions.
 
 
 @ti.func
@@ -120,8 +120,8 @@ def svd_signed(f):
 
 @ti.func
 def mapped_values(s, mu, lam, yield_strain):
-    """Return mapping of singular values: the new ones g, eigenvalues of tau, clamped Hencky strains, factor k
-    of their deviator, and |dev|."""
+    """Return mapping of singular values: returns the new values g, eigenvalues of tau, clamped Hencky
+    strains, factor k of their deviator, and |dev|."""
     e = s * 0.0
     for i in ti.static(range(3)):
         e[i] = ti.log(ti.max(s[i], SINGULAR_VALUE_MIN))

@@ -5,11 +5,11 @@ vector of lanes (x 0:3, v 3:6, C 6:15, F 15:24), so that the material update run
 CPU and loads coalesce on CUDA. Tile t of environment e at time slot s is entry ``((s * batch + e) * tiles +
 t) * 24 + component``.
 
-Grids are dense in memory and sparse in use: only blocks of 4^3 nodes that hold mass are read, written and
-cleared. Array index i along an axis is node i - 1: the layer below the domain is there because particles
-within dx/2 of the floor reach it. On the CPU an environment's particles are split into ``chunks`` of
-consecutive particles with a private grid each, so that scattering needs no atomics and its result does not
-depend on the number of threads.
+Grids are dense in memory and sparse in use: only blocks of 4^3 nodes with mass are read, written and cleared.
+Array index i along an axis is node i - 1: the layer below the domain is there because particles within dx/2
+of the floor reach it. On the CPU an environment's particles are split into ``chunks`` of consecutive
+particles with a private grid each, so that scattering needs no atomics and its result does not depend on the
+number of threads.
 """
 
 import math
@@ -53,8 +53,8 @@ STATE_MASK = 2**27 - 1
 its successors fit into 32 bits."""
 
 INDEX_MASK = 2**30 - 1
-"""Largest index into other fields on the CPU, all bits set; on CUDA grids are read in halves of a node, which
-are numbered in 32 bits."""
+"""Largest index into other fields on the CPU, all bits set; on CUDA grids are read in half nodes with 32-bit
+indices."""
 
 # The following constants are strides of the threads' working areas. They prevent false sharing: a cache line
 # used by two threads costs more than the work itself.
@@ -93,7 +93,7 @@ PIECE = 1 << 21
 
 
 class Storage:
-    """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
+    """Fields and constants shared by all phases of a substep; see the module's docstring for the layout."""
 
     def __init__(
         self,
@@ -123,10 +123,10 @@ class Storage:
         self.tiles = -(-self.particles // self.lanes)
         self.chunks = 1 if self.cuda else CHUNKS
         self.substeps = first.substeps
-        # Threads beyond one per environment team up on its chunks.
+        # Additional threads per environment work on its chunks as a team.
         self.threads = runtime.threads
         self.team_size = min(self.chunks, max(1, runtime.threads // self.batch))
-        # Materials of an environment: 1, or one per body.
+        # Number of materials of an environment: 1, or one per body.
         self.materials = first.material_count
         self.mixed = self.materials > 1
         self.laws: tuple[Law, ...] = tuple(dict.fromkeys(m.kind for m in first.materials[: self.materials]))
@@ -146,7 +146,7 @@ class Storage:
         self.mass = scene.particle_mass
         self.stress_scale = -scene.dt * scene.particle_volume * 4.0 * self.inv_dx**2
         self.x_max = 1.0 - 3.0 * scene.dx
-        # Of a stencil: the release truncates toward zero where plab rounds down.
+        # Rounding of the base node: the release truncates toward zero, plab rounds down.
         self.lowest_base = 0 if scene.floor_stencil == "release" else -1
         self.blocks_per_axis = -(-self.n // BLOCK)
         self.axis = self.blocks_per_axis * BLOCK
@@ -163,7 +163,7 @@ class Storage:
         self.action_dims = tuple(m.action_dim for m in manipulators)
         self.action_offsets = tuple(sum(self.action_dims[:m]) for m in range(self.manipulators))
         self.actions_per_step = sum(self.action_dims)
-        # Consecutive manipulators of one shape share one loop, hence one compiled body.
+        # Consecutive manipulators of one shape share one loop and its compiled body.
         groups = [list(group) for _, group in groupby(range(self.manipulators), key=self.shapes.__getitem__)]
         self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)
 
@@ -176,16 +176,16 @@ class Storage:
         return MANIPULATOR_SHAPES[shape].turns
 
     def rotated(self, shape: str) -> bool:
-        """Return True if the rotation of a shape's frame matters: round shapes have a spin only."""
+        """Return True if the rotation of a shape's frame is needed; round shapes only have a spin."""
         return self.turns(shape) or not SURFACES[shape].round
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
         m = max(1, self.manipulators)
         self.lane_type = ti.types.vector(self.lanes, real)
-        # Vectors first: fields lie one behind the other, and behind single numbers a vector straddles two
-        # cache lines, which costs the CPU 7 % of a step.
-        # Stress and momentum gradient A (9) of each particle within one substep.
+        # Vectors first: fields are consecutive in memory, and after single numbers vectors would straddle
+        # cache lines, which costs the CPU 7 % of a step. Stress and momentum gradient A (9) of each particle
+        # within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         if self.mixed:
             # Coefficients of each particle and, with several laws, the number of its law; and the number of
@@ -204,7 +204,7 @@ class Storage:
         self.low = self.share(ti.Vector.field(3, ti.f64, shape=(b, m)))
         self.high = self.share(ti.Vector.field(3, ti.f64, shape=(b, m)))
         self.minimal_gap = self.share(ti.field(ti.f64, shape=(b, m)))
-        # Decay rate of the soft contact model; 0 is the hard one.
+        # Decay rate of the soft contact model; 0 for the hard model.
         self.alpha = self.share(ti.field(real, shape=b))
         # Poses within one environment step, and the frames derived from them for contact.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
@@ -250,7 +250,7 @@ class Storage:
 
     @ti.kernel
     def clear_adjoint(self, bar: Array):
-        """Begin a gradient: clear the adjoints of particles and those that are sums over its steps."""
+        """Begin a gradient: clear particle adjoints and accumulated adjoints."""
         for i in bar:
             for k in ti.static(range(self.lanes)):
                 bar[i][k] = 0.0

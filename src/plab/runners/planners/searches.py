@@ -121,7 +121,7 @@ class Multistart(Planner):
             self._adam.state.pop(self._places[place], None)
 
     def _descend(self, gradient: Tensor | None) -> None:
-        """Make a step of Adam by gradients of shape [P, T, A]."""
+        """Make a step of Adam with gradients of shape [P, T, A]."""
         assert gradient is not None
         for place, own in zip(self._places, gradient, strict=True):
             place.grad = own

@@ -1,8 +1,8 @@
 """Files of LLVM bitcode that Taichi links into its kernels, written when first needed.
 
-A file has the functions of the transfers or of one law, for one device and one precision. Its name in plab's
-cache folder contains a digest of its sources. Taichi identifies compiled kernels by these names, so editing a
-formula triggers recompilation.
+A file contains the functions of the transfers or of one law, for one device and one precision. Its name in
+plab's cache folder contains a digest of its sources. Taichi identifies compiled kernels by these names, so
+editing a formula triggers recompilation.
 
 Taichi 1.7 has LLVM 15, compatible with bitcode from llvmlite 0.42 to 0.44; Quadrants has LLVM 22, as llvmlite
 0.50.
@@ -39,7 +39,7 @@ LAYOUTS = {
     "darwin-x86_64": f"e-m:o-{X86}",
     "darwin-arm64": "e-m:o-i64:64-i128:128-n32:64-S128",
 }
-"""Data layouts of the platforms that Taichi has wheels for; Quadrants' LLVM aligns i128, too."""
+"""Data layouts of the platforms with wheels of Taichi; Quadrants' LLVM aligns i128, too."""
 
 PLATFORM = f"{sys.platform}-{platform.machine().lower()}"
 

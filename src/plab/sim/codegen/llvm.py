@@ -44,7 +44,8 @@ class Code:
         *,
         grid: bool = True,
     ) -> None:
-        """Begin a function of addresses, perhaps a grid's nodes per axis, and numbers; texts name them."""
+        """Begin a function with named arguments: addresses, optionally a grid's nodes per axis, and
+        numbers."""
         self.real = real
         self.single = isinstance(real, ir.FloatType)
         kinds = {
@@ -94,7 +95,7 @@ class Code:
         return self.mul(series, self._b.bitcast(shifted, a.type))
 
     def log(self, a: ir.Value) -> ir.Value:
-        """Natural logarithm of positive normal numbers, by the series of atanh; of others, some number."""
+        """Natural logarithm of positive normal numbers, by the series of atanh; undefined for others."""
         bits, bias, terms = (23, 127, 5) if self.single else (52, 1023, 11)
         wide = self._integers(a, 32 if self.single else 64)
         word = self._b.bitcast(a, wide)
@@ -170,14 +171,14 @@ class Code:
         return reduce(self.add, map(self.mul, a, b))
 
     def least(self, a: ir.Value, b: ir.Value) -> ir.Value:
-        """The lesser number, ``b`` where one is NaN."""
+        """The smaller number, ``b`` if either is NaN."""
         return self._b.select(self._b.fcmp_ordered("<", a, b), a, b)
 
     def most(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.select(self._b.fcmp_ordered(">", a, b), a, b)
 
     def inside(self, y: ir.Value, end: ir.Value, value: ir.Value) -> ir.Value:
-        """A value where y is in [0, end] or NaN, else 0."""
+        """A value if y is in [0, end] or NaN, otherwise 0."""
         low = self._b.fcmp_ordered("<", y, self.real(0.0))
         out = self._b.or_(low, self._b.fcmp_ordered(">", y, end))
         return self._b.select(out, self.real(0.0), value)
@@ -314,7 +315,7 @@ class Scalars(Code):
 
 
 class Number:
-    """A vector of lanes, or one number: operators write an instruction each."""
+    """A vector of lanes, or one number; each operator emits an instruction."""
 
     def __init__(self, code: Code, value: ir.Value) -> None:
         self.code, self.value = code, value
@@ -366,13 +367,13 @@ class Number:
         return _UFUNCS[function](*given) if function in _UFUNCS else self._operation(_NAMES[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Number:
-        """:func:`numpy.where`; no other of NumPy's functions of arrays is known."""
+        """:func:`numpy.where`; other NumPy functions of arrays are not supported."""
         assert function is np.where
         return self._operation("chosen", *given)
 
 
 _NAMES = {np.sqrt: "root", np.minimum: "least", np.maximum: "most", np.exp: "exp", np.log: "log"}
-"""Methods of :class:`Code` that NumPy's functions stand for."""
+"""Methods of :class:`Code` for NumPy's functions."""
 
 _UFUNCS = {
     np.add: operator.add,

@@ -75,7 +75,7 @@ def law_adjoint(
 
 
 class TracedSeries(algebra.Series):
-    """The series, with the derivative of J^(-2/3) instead of that of Newton's steps."""
+    """The series, with the exact derivative of J^(-2/3) instead of differentiated Newton steps."""
 
     def unimodular_scale(self, j: Any) -> Any:
         own = algebra.Series.unimodular_scale
@@ -446,7 +446,7 @@ def scheduled_particle(module: ir.Module, name: str, real: ir.Type) -> None:
 
 def scheduled_particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     """Adjoints of C and F in their places, from those of A, ``a``, and of the new F, ``b``, and those of the
-    coefficients in theirs; untouched where the series do not serve."""
+    coefficients in theirs; unchanged outside the range of the series."""
     one = Particle(module, name, real, "c9 f9 a9 b9 p3", f"{' '.join(CONSTANTS)} {RANGE}")
     code, c, f, a_bar, g_bar = one.code, one.take("c"), one.take("f"), one.take("a"), one.take("b")
     mu, lam, limit = one.take("p")

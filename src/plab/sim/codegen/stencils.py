@@ -19,7 +19,7 @@ from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, MOMENTUM_FIELD, OFFSETS,
 
 
 def rows_of(code: Code, grid: ir.Value) -> list[list[ir.Value]]:
-    """Return where the rows of a stencil begin, by offset along x and y; ``grid`` is its base node."""
+    """Return the addresses of the rows of a stencil, by offset along x and y; ``grid`` is its base node."""
     along_y = code.mul_word(code.args["axis"], WORD(4))
     along_x = code.mul_word(along_y, code.args["axis"])
     out: list[list[ir.Value]] = []
@@ -59,7 +59,7 @@ class Stencil(Code):
                 x = self.both(self.add, x, field[1])
 
     def reduced(self, row: Row, weights: Sequence[ir.Value]) -> ir.Value:
-        """The sum of a row's 4-vectors, weighted; of the last ones, if there are fewer weights."""
+        """Weighted sum of a row's 4-vectors; with fewer weights, of the last ones."""
         parts = self.parts(row)[3 - len(weights) :]
         return self.dot(parts, [self.splat(weight, 4) for weight in weights])
 
