@@ -246,8 +246,8 @@ class Attempt:
         return found
 
     def errors(self, setting: Resolution, result: Result, exact: Result, grid: int) -> dict[str, float]:
-        """Return the errors of a result by column, NaN where there is nothing to compare; mass tensors are
-        compared on ``grid`` nodes per axis."""
+        """Return the errors of a result by column, NaN if not applicable; mass tensors are compared on
+        ``grid`` nodes per axis."""
         end = self.ends[setting.axis]
         errors = dict.fromkeys(("positions", "mass", "score", "gradient", "angle_deg"), float("nan"))
         if result.outcome != "stable":

@@ -31,7 +31,7 @@ class NearestContact(DistanceTerm):
 
     @ti.func
     def start(self):
-        """Far away, and no particle."""
+        """Initial tally: a large distance, and no particle."""
         return ti.Vector([FAR, 0.0], ti.f64)
 
     @ti.func

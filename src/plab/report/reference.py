@@ -42,7 +42,7 @@ class Benchmark:
     Attributes:
         file: File name in a folder of benchmarks.
         command: Command that generates it, with placeholders ``{file}`` and ``{folder}``.
-        columns: Columns that are needed.
+        columns: Required columns.
     """
 
     file: str

@@ -158,7 +158,7 @@ def scores_last_iteration(config: Mapping[str, Any]) -> bool:
 
 
 def last_score(rows: Mapping[str, np.ndarray]) -> float:
-    """Return the score of the last of some iterations, given their columns, as it was simulated."""
+    """Return the score of the last iteration as simulated, given the columns of the iterations."""
     trained = rows.get("train_score", [np.nan])[-1]
     # There may be no completed training episode.
     return float(rows["score"][-1] if np.isnan(trained) else trained)

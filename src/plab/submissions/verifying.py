@@ -87,7 +87,7 @@ class Verification:
 
     @property
     def outcomes(self) -> set[str]:
-        """All outcomes that occur."""
+        """Set of the outcomes of all entries."""
         return {verdict.outcome for verdict in self.verdicts}
 
 
