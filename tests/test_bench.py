@@ -1,4 +1,4 @@
-"""The speed benchmark: complete rows, printed and written."""
+"""Benchmarks: complete rows of the speed benchmark, cases that survive, policies in unseen scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.bench import speed, unseen, workload
+from plab.bench import speed, stability, unseen, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
 
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
@@ -59,3 +59,8 @@ def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
     (row,) = read(table)
     assert (row["policy"], row["scenes"]) == ("test_bench:still", "3") and float(row["score"]) < 0.05
     assert unseen.main(words) == 2
+
+
+@pytest.mark.nightly
+def test_every_quick_case_of_stability_survives() -> None:
+    assert stability.main(["--quick", "--precision", "float32"]) == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from plab.cli.run import main
-from plab.config import ConfigError, build_scene, choices, load_config
+from plab.config import ConfigError, build_scene, load_config
 from plab.targets import build_target
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,14 +62,6 @@ def test_every_variant_of_the_example_is_valid_and_keeps_the_volume():
         start = {name: (body.shape, body.size) for name, body in cfg.task.bodies.items()}
         end = {name: (body["shape"], body["size"]) for name, body in cfg.task.target["bodies"].items()}
         assert start == end
-
-
-def test_names_of_both_folders_are_offered(capsys):
-    assert main(["--help-all", "--config-dir", str(OWN)]) == 0
-    text, _ = capsys.readouterr()
-    for name in ("task=Dumbbell ", "task=Rope ", "sim=coarse ", "sim=fast "):
-        assert name in text
-    assert {*choices("task"), "Dumbbell"} == set(choices("task", OWN))
 
 
 def test_a_sweep_over_tasks_of_both_folders(seen):

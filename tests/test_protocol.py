@@ -115,16 +115,6 @@ def test_masses_rotations_and_the_floor_of_a_simulator(simulator: Simulator) -> 
         simulator.set_scenes([replace(scene, floor_stencil="plab") for scene in SCENES])
 
 
-def test_weights_of_the_lowest_half_cell() -> None:
-    n = 32
-    column = spread_mass([[0.5, 0.0, 0.5]], n, 1.0, "release").sum(axis=(0, 2))
-    np.testing.assert_allclose(column[:4], [1.125, -0.25, 0.125, 0.0], atol=1e-15)
-    at_the_edge = spread_mass([[0.5, 0.5 / n, 0.5]], n, 1.0, "release").sum(axis=(0, 2))
-    np.testing.assert_allclose(at_the_edge[:4], [0.5, 0.5, 0.0, 0.0], atol=1e-15)
-    inside = np.random.default_rng(0).uniform(0.5 / n, 0.9, (50, 3))
-    assert np.array_equal(spread_mass(inside, n, 1.0, "release"), spread_mass(inside, n, 1.0))
-
-
 def test_the_start_is_the_legacy_draw() -> None:
     bodies = (Body("box", (0.6, 0.08, 0.5), (0.16,) * 3, 6000), Body("sphere", (0.3, 0.06, 0.5), (0.06,), 4))
     x = sample_particles(Scene("Assembly", bodies, (), sampling_convention="release"))
