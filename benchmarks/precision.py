@@ -27,7 +27,7 @@ from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
-from plab.report.accuracy import precision_summary
+from plab.report.figures import precision_summary
 from plab.scenes import DEVICES, Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS

@@ -22,7 +22,7 @@ from plab.config.suite import suite_tasks
 from plab.demonstrations import SCORES, known_actions
 from plab.errors import ConfigError
 from plab.render.rollouts import stored
-from plab.results.table import Row, readable_rows
+from plab.results.table import Row, rows
 from plab.scenes import Scene
 from plab.targets.scripted import DECIMALS
 
@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     options = parser.parse_intermixed_args(sys.argv[1:] if argv is None else argv)
     sources, words = sources_and_words(options.sources, default=None)
-    runs = readable_rows(sources)[0] if sources else []
+    runs = rows(sources)[0] if sources else []
     for task in options.task:
         cfgs = variants(task, words)
         if build_scene(cfgs[0]) != build_scene(load_config([f"task={task}", "variant=1"])):

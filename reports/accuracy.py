@@ -25,13 +25,12 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 import numpy as np
 import pandas as pd
 
-from plab.report.accuracy import precision_summary, work_precision
-from plab.report.figures import Drawing, legend_of_methods, single, style
-from plab.report.formats import number
+from plab.report.figures import Drawing, legend, precision_summary, single, style, work_precision
 from plab.report.methods import method
 from plab.report.notebook_cells import benchmark, gather, show_figure, show_origin, show_table
 from plab.report.reference import ACCURACY, PRECISION, origin
-from plab.report.series import load_series
+from plab.report.statistics import load_series
+from plab.report.tables import number
 
 runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
@@ -81,9 +80,9 @@ def draw_contact_models(runs, series):
         best = rows["score"][rows["iteration"] == row["best_iteration"]]
         if len(best):
             before = min(max(float(best[0]), 0.0), 1.0)
-            panel.plot(
-                before, row["score_best"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
-            )
+            look = method(row["method"])
+            dots = {"color": look.colour, "label": look.label, "markersize": 3.5, "alpha": 0.8}
+            panel.plot(before, row["score_best"], "o", **dots)
             gaps[row["method"]].append(row["score_best"] - before)
     panel.set(
         xlim=(-0.02, 1.02),
@@ -91,7 +90,7 @@ def draw_contact_models(runs, series):
         xlabel="score of the best row, in its own contact model",
         ylabel="score of the final evaluation, hard contact",
     )
-    legend_of_methods(figure, [name for name in runs.methods if gaps[name]])
+    legend(figure)
     numbers = {
         name: {"runs": len(own), "mean": float(np.mean(own)), "largest": float(max(own, key=abs))}
         for name, own in gaps.items()

@@ -13,10 +13,18 @@ import synthetic
 from plab.cli.report import main
 from plab.config.selection import select
 from plab.report.collect import NAMES, collect, collect_ablation
-from plab.report.curves import rl_scores
-from plab.report.figures import style
-from plab.report.series import at_budgets, band, load_series, rows_on_axes, scores_at
-from plab.report.statistics import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.figures import rl_scores, style
+from plab.report.statistics import (
+    at_budgets,
+    band,
+    common_strata,
+    improvement,
+    interquartile_mean,
+    load_series,
+    performance_profile,
+    rows_on_axes,
+    scores_at,
+)
 from plab.report.tables import score_at_budget
 
 # ------------------------------------------------------------------------------------------------------ bands

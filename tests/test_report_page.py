@@ -15,8 +15,8 @@ from plab.cli.report import main
 from plab.config.selection import select
 from plab.render.graphics import missing_graphics
 from plab.report.collect import NAMES, collect
-from plab.report.media import best_runs
 from plab.report.methods import method
+from plab.report.page import best_runs
 from plab.report.statistics import interquartile_mean, shared_strata
 from plab.results import load
 from synthetic_runs import synthetic_run, template

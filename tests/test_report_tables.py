@@ -19,11 +19,19 @@ from plab.config import load_config
 from plab.config.selection import select
 from plab.errors import ArgumentError
 from plab.report.collect import NAMES, MixedRunsError, Runs, Setting, changed_settings, collect
-from plab.report.formats import NOTHING, Table, number
-from plab.report.hyperparameters import hyperparameters
 from plab.report.methods import method as look
 from plab.report.statistics import Summary, stratified_difference, summarise
-from plab.report.tables import agreement, distances, iou_per_configuration, iou_per_task, timing
+from plab.report.tables import (
+    NOTHING,
+    Table,
+    agreement,
+    distances,
+    hyperparameters,
+    iou_per_configuration,
+    iou_per_task,
+    number,
+    timing,
+)
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load
 from plab.results.examples import EXAMPLES, example_archive

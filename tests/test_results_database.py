@@ -18,7 +18,7 @@ from plab.cli.results import main
 from plab.cli.rollouts import render, resolve_rollout
 from plab.config.selection import Selection
 from plab.report.collect import collect
-from plab.report.series import load_series
+from plab.report.statistics import load_series
 from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, table, write
 from plab.status import survey
 

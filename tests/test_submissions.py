@@ -22,7 +22,9 @@ import synthetic
 from plab.cli.submissions import leaderboard, submit, verify
 from plab.config import load_config
 from plab.config.suite import suite_tasks
+from plab.files import read_members
 from plab.report.reference import paper_table
+from plab.results import ResultsError
 from plab.submissions import submission
 from plab.submissions.board import Board, board
 from plab.submissions.submission import (
@@ -32,12 +34,10 @@ from plab.submissions.submission import (
     Configuration,
     Entry,
     Submission,
-    SubmissionError,
     configuration_of,
     encode,
     parse_card,
     read,
-    read_members,
     write,
 )
 from plab.submissions.verifying import (
@@ -91,8 +91,8 @@ def with_manifest(path: Path, values: dict[str, Any], entry: int | None = None) 
 
 
 def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the one-line message of the SubmissionError that a call raises."""
-    with pytest.raises(SubmissionError) as caught:
+    """Return the one-line message of the error that a call raises."""
+    with pytest.raises(ResultsError) as caught:
         function(*args, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
@@ -162,10 +162,10 @@ def npy(array: np.ndarray, **options: Any) -> bytes:
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (b"\x93NUMPY\x01\x00rubbish", "no NumPy file"),
-        (npy(ACTIONS)[:-8], "cut off"),
+        (b"\x93NUMPY\x01\x00rubbish", "no NumPy array"),
+        (npy(ACTIONS)[:-8], "no NumPy array"),
         # More than memory has, says the header.
-        (npy(np.zeros((10, 3))).replace(b"(10, 3)", b"(99, 9)"), "cut off"),
+        (npy(np.zeros((10, 3))).replace(b"(10, 3)", b"(99, 9)"), "no NumPy array"),
         (npy(ACTIONS * 1.1), "[-1, 1]"),
         (npy(ACTIONS * np.nan), "[-1, 1]"),
         (npy(np.array([[print]], object), allow_pickle=True), "NumPy"),
@@ -182,19 +182,14 @@ def test_actions_that_are_refused(path: Path, content: bytes, fault: str) -> Non
     ("place", "values", "named"),
     [
         (None, {"format": 7}, "layout 7"),
-        (None, {"format": None}, "format"),
         (None, {"plab": "<script>"}, "plab"),
         (None, {"physics": "1"}, "physics"),
-        (None, {"entries": None}, "entries"),
-        (1, {"note": ""}, "entry 1"),
-        (1, {"task": "Moove"}, "'Moove'"),
+        (None, {"entries": None}, "manifest"),
         (1, {"task": ["Move"]}, "['Move']"),
         (1, {"variant": "random7"}, "'random7'"),
         (1, {"score": 10**400}, "score"),
         (1, {"score": float("nan")}, "score"),
-        (1, {"steps": -1}, "steps"),
         (1, {"steps": True}, "steps"),
-        (1, {"scene": "x"}, "scene"),
         (1, {"file": "actions/9.npy"}, "actions/9.npy"),
         (1, {"file": "card.yaml"}, "card.yaml"),
         (1, {"targets": "authors", "variant": UNSEEN[0]}, UNSEEN[0]),
@@ -359,7 +354,7 @@ def test_scores_are_means_of_whole_tables_within_budgets(leaders: Board) -> None
 
 
 def test_what_does_not_belong_is_left_out_with_a_reason(leaders: Board, folder: Path) -> None:
-    reasons = {"believed": "verify", "deep": "JSON", "foreign": "scene of Move-v1", "liar": "1 claim"}
+    reasons = {"believed": "damaged", "deep": "damaged", "foreign": "scene of Move-v1", "liar": "1 claim"}
     reasons |= {"recording": "card", "rubbish": "zip"}
     for line, (name, reason) in zip(sorted(leaders.left_out), reasons.items(), strict=True):
         assert line.startswith(str(folder / f"{name}.")) and reason in line

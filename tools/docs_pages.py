@@ -72,7 +72,7 @@ PYTHON = {
             "plab.envs.sb3",
             "plab.envs.tensors",
             "plab.envs",
-            "plab.submissions.recorder",
+            "plab.submissions",
         ),
     ),
     "results": (

@@ -10,8 +10,10 @@ import hashlib
 import io
 import lzma
 import os
+import shutil
 import stat
 import sys
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,6 +38,10 @@ _LONGEST_HEADER = 4096
 
 _LARGEST_SHAPE = 1 << 28
 """Largest file of a mesh, point cloud or mass tensor [B]; a million triangles as text take 250 MB."""
+
+
+UNFINISHED = ".unfinished-"
+"""Start of the names of files and folders that are being written."""
 
 
 class UnreadableError(ValueError):
@@ -74,6 +80,19 @@ def regular_file(path: Path) -> os.stat_result:
     return found
 
 
+@contextmanager
+def complete_folder(folder: Path) -> Iterator[Path]:
+    """Give an empty folder beside one that is not there, or empty, which takes its place if nothing fails."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder.parent))
+    try:
+        yield fresh
+        fresh.chmod(0o755)
+        fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
 # --------------------------------------------------------------------------------------------------- archives
 
 
@@ -97,6 +116,20 @@ def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]
             _check_members(archive, len(content) if packed else found.st_size)
         with archive:
             yield archive
+
+
+def read_members(path: Path, most: int = LARGEST) -> dict[str, bytes]:
+    """Return the content of all members of a zip file, by name.
+
+    Raises:
+        UnreadableError: If they would take more than ``most`` bytes; see also :func:`opened_zip`.
+        ValueError: If it is no zip file, or damaged.
+        OSError: If it cannot be opened.
+    """
+    with opened_zip(path) as archive:
+        if sum(info.file_size for info in archive.infolist()) > most:
+            raise UnreadableError(f"it would unpack to more than the {most / 1e6:.3g} MB allowed")
+        return {name: member_bytes(archive, name) for name in archive.namelist()}
 
 
 def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
@@ -170,7 +203,7 @@ def read_array(path: Path) -> np.ndarray:
     """
     regular_file(path)
     with path.open("rb") as file:
-        return _array(file)
+        return array_in(file)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -182,19 +215,16 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         OSError: If it cannot be opened.
     """
     arrays = {}
-    with opened_zip(path) as archive:
-        if sum(info.file_size for info in archive.infolist()) > LARGEST:
-            raise UnreadableError(f"its arrays would take more than {LARGEST / 1e9:.1f} GB")
-        for name in archive.namelist():
-            content = io.BytesIO(member_bytes(archive, name))
-            try:
-                arrays[name.removesuffix(".npy")] = _array(content)
-            except UnreadableError as error:
-                raise UnreadableError(f"{name}: {error}") from error
+    for name, content in read_members(path).items():
+        try:
+            arrays[name.removesuffix(".npy")] = array_in(io.BytesIO(content))
+        except UnreadableError as error:
+            raise UnreadableError(f"{name}: {error}") from error
     return arrays
 
 
-def _array(file: BinaryIO) -> np.ndarray:
+def array_in(file: BinaryIO) -> np.ndarray:
+    """Return the array of an open ``.npy`` file, as :func:`read_array` does."""
     try:
         with _damage():
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)

@@ -291,8 +291,7 @@ def main(argv: Sequence[str]) -> None:
     """Compare settings with references, print, write the table and the diagrams."""
     import pandas as pd
 
-    from plab.report.accuracy import diagrams
-    from plab.report.figures import save, style
+    from plab.report.figures import diagrams, save, style
 
     parser = Parser("plab bench accuracy", __doc__)
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")

@@ -156,15 +156,15 @@ def sources_and_words(
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     """Return the finished runs that words choose, all of one protocol; ResultsError if there are none."""
     from plab.results.schema import ResultsError
-    from plab.results.table import readable_rows
+    from plab.results.table import rows
 
     chosen = select(words, ("task", "variant", "method", "seed"))
-    found, _ = readable_rows(sources)
-    rows = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
-    one_protocol(row.config for row in rows)
-    if not rows:
+    found, _ = rows(sources)
+    fitting = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
+    one_protocol(row.config for row in fitting)
+    if not fitting:
         raise ResultsError(f"there is no finished run in {', '.join(map(str, sources))}: no run fits")
-    return rows
+    return fitting
 
 
 def positive(text: str, least: int = 1) -> int:

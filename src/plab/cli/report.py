@@ -21,9 +21,8 @@ from plab.errors import tell
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
-from plab.report.media import missing_pictures, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_notebooks
-from plab.report.page import Page
+from plab.report.page import Page, missing_pictures, remove_earlier
 from plab.report.reference import ACCURACY, SPEED, measured
 from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError

@@ -30,7 +30,7 @@ from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError
-from plab.results.table import readable_rows
+from plab.results.table import rows
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 
@@ -74,9 +74,9 @@ def _sql(argv: Sequence[str]) -> None:
     add_sources(parser)
     add_forms(parser)
     options = parser.parse_intermixed_args(argv)
-    columns, rows, unreadable = query(sources_and_words(options.sources)[0], options.query)
+    columns, answer, unreadable = query(sources_and_words(options.sources)[0], options.query)
     _report_skipped(unreadable)
-    print_table(columns, rows, options.form)
+    print_table(columns, answer, options.form)
 
 
 def _check(argv: Sequence[str]) -> int:
@@ -113,7 +113,7 @@ def _pack(argv: Sequence[str]) -> None:
             raise ArgumentError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
     if words:
         others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
-        require_possible(Selection(others, chosen.keys), readable_rows(sources)[0])
+        require_possible(Selection(others, chosen.keys), rows(sources)[0])
     chosen = _finished_by_default(chosen)
     done = pack(
         sources,

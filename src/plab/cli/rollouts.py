@@ -127,20 +127,20 @@ def view(argv: Sequence[str]) -> None:
     require_writable(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     from plab.render.rollouts import demonstration, record_with_motion
+    from plab.results.run_file import replace_file
     from plab.view.page import gallery, page
 
-    output.parent.mkdir(parents=True, exist_ok=True)
     if options.gallery:
         pages = []
         for task, (cfg,) in _of_all_tasks(options, variants=False):
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
             shown = page(recording, options.every, surface=options.surface)
-            output.with_name(file).write_text(shown, encoding="utf-8")
+            replace_file(output.with_name(file), shown)
             pages.append((task, file, recording.score))
-        output.write_text(gallery(pages), encoding="utf-8")
+        replace_file(output, gallery(pages))
     else:
         shown = page(record_with_motion(*rollout(options)), options.every, surface=options.surface)
-        output.write_text(shown, encoding="utf-8")
+        replace_file(output, shown)
     print(output)
 
 
@@ -173,11 +173,12 @@ def export(argv: Sequence[str]) -> None:
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
     from plab.export.files import write_ply, write_vtk
+    from plab.files import complete_folder
     from plab.render.rollouts import record_with_motion
 
     recording = record_with_motion(*rollout(options))
-    output.mkdir(parents=True, exist_ok=True)
-    (write_vtk if options.format == "vtk" else write_ply)(recording, output, options.every or 1)
+    with complete_folder(output) as fresh:
+        (write_vtk if options.format == "vtk" else write_ply)(recording, fresh, options.every or 1)
     print(output)
 
 

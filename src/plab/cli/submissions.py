@@ -13,8 +13,9 @@ from plab.cli.tables import print_table
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import PlabError, tell
-from plab.report.series import BUDGETS
-from plab.report.templates import asset, render
+from plab.report.page import asset, render
+from plab.report.statistics import BUDGETS
+from plab.results.run_file import replace_file
 from plab.scenes import PRECISIONS
 from plab.submissions.board import board
 from plab.submissions.collecting import from_policies, from_sources, submission_files
@@ -197,9 +198,8 @@ def leaderboard(argv: Sequence[str]) -> None:
             "overrides": options.overrides,
         },
     )
-    options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "index.html"
-    path.write_text(html, encoding="utf-8", newline="\n")
+    replace_file(path, html)
     for line in made.left_out:
         tell(f"left out: {line}")
     print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")

@@ -15,7 +15,7 @@ import pandas as pd
 from plab.config import Config, build_scene
 from plab.targets import demonstration
 
-__all__ = ["known_actions", "load_actions", "recorded_scores"]
+__all__ = ["known_actions", "load_actions"]
 
 FOLDER = Path(__file__).parent
 SCORES = "scores.csv"
@@ -53,11 +53,3 @@ def known_actions(cfg: Config) -> np.ndarray | None:
     """
     scripted = demonstration(build_scene(cfg), cfg.task.target)
     return load_actions(cfg.task.name, cfg.variant) if scripted is None else scripted
-
-
-def recorded_scores() -> pd.DataFrame:
-    """Return the recorded scores of the demonstrations: columns task, variant, score."""
-    path = FOLDER / SCORES
-    if not path.is_file():
-        return pd.DataFrame(columns=["task", "variant", "score"])
-    return pd.read_csv(path, dtype={"variant": str})

@@ -8,8 +8,6 @@ steps; ``metadata.json`` has the spaces. The package minari can read both, but i
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Dict, Space
 
 from plab.errors import PlabError
+from plab.files import complete_folder
 
 __all__ = ["DatasetError", "Episode", "metadata_of", "read_episodes", "write_dataset"]
 
@@ -83,9 +82,7 @@ def write_dataset(
     place = folder / name / "data"
     if place.exists():
         raise DatasetError(f"{place.parent} exists: remove it, or choose another name with --name")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=".data-", dir=place.parent))
-    try:
+    with complete_folder(place) as beside:
         attributes, steps = [], 0
         with h5py.File(beside / "main_data.hdf5", "w", track_order=True) as file:
             for number, episode in enumerate(episodes):
@@ -108,10 +105,6 @@ def write_dataset(
             **about,
         }
         (beside / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
-        beside.chmod(0o755)
-        beside.rename(place)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
     return attributes
 
 

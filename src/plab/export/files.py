@@ -7,23 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 import numpy as np
 import pyvista as pv
+from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from plab.progress import show_progress
 from plab.render.renderer import (
     BODY_COLORS,
     MANIPULATOR_COLOR,
     TARGET_COLOR,
-    part_mesh,
     surface_mesh,
     target_mesh,
 )
 from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
+from plab.results.run_file import replace_file
 
 Things = Callable[[int], Mapping[str, pv.PolyData]]
 """Function that returns the meshes of a step, by name."""
@@ -45,7 +47,7 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     for step, things in _frames(recording, every, _vtk_things):
         for name, mesh in things.items():
             file = f"{name}_{step:04d}.vtp"
-            mesh.save(folder / file)
+            _save_vtp(mesh, folder / file)
             series.setdefault(name, {})[step * scene.substeps * scene.dt] = file
     for name, files in series.items():
         root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
@@ -54,7 +56,7 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
             ElementTree.SubElement(collection, "DataSet", timestep=f"{time:.9g}", part="0", file=file)
         ElementTree.ElementTree(root).write(folder / f"{name}.pvd", encoding="utf-8", xml_declaration=True)
     if (target := _target(recording)) is not None:
-        target.save(folder / "target.vtp")
+        _save_vtp(target, folder / "target.vtp")
 
 
 def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
@@ -91,7 +93,20 @@ def _frames(
 def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], path: Path) -> None:
     """Write a mesh with points coloured from a palette."""
     rgb = np.array([pv.Color(color).int_rgb for color in palette], np.uint8)
-    mesh.triangulate().save(path, texture=rgb[np.asarray(numbers) % len(rgb)])
+    # VTK's own writers end the process with a segmentation fault where a disk is full.
+    with TemporaryDirectory() as place:
+        file = Path(place) / path.name
+        mesh.triangulate().save(file, texture=rgb[np.asarray(numbers) % len(rgb)])
+        replace_file(path, file.read_bytes())
+
+
+def _save_vtp(mesh: pv.PolyData, path: Path) -> None:
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(mesh)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    replace_file(path, writer.GetOutputString())
 
 
 # ----------------------------------------------------------------------------------------------------- things
@@ -143,7 +158,7 @@ def _surfaces(recording: RecordedRollout) -> Things:
     scene = recording.scene
     bodies = list(zip(body_slices(scene), body_surfaces(scene), strict=True))
     parts = [
-        (number, part.side, part_mesh(part))
+        (number, part.side, part.mesh)
         for number, manipulator in enumerate(scene.manipulators)
         for part in manipulator_parts(manipulator)
     ]

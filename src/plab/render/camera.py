@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from plab.objective import TARGET_MASS
-from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.scenes import Camera, Scene, sample_particles
 
 
@@ -62,12 +61,15 @@ def scene_camera(
         x: Positions of particles [domain units], shape [..., 3]; those at t = 0 if None.
         poses: Poses of the manipulators, shape [time, manipulator, 8]; those at t = 0 if None.
     """
+    # Imported here: fit_camera needs no PyVista.
+    from plab.render.shapes import manipulator_parts, pose_matrix, transform
+
     if poses is None:
         poses = np.array([[[*m.position, *m.rotation, m.gap] for m in scene.manipulators]])
     seen = [(sample_particles(scene) if x is None else x).reshape(-1, 3)]
     for number, manipulator in enumerate(scene.manipulators):
         for part in manipulator_parts(manipulator):
-            seen += [transform(pose_matrix(pose, part.side), part.vertices) for pose in poses[:, number]]
+            seen += [transform(pose_matrix(pose, part.side), part.mesh.points) for pose in poses[:, number]]
     if target_mass is not None:
         seen.append(np.argwhere(target_mass > TARGET_MASS) * scene.dx)
     points = np.concatenate(seen)

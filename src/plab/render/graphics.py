@@ -11,7 +11,6 @@ from importlib.util import find_spec
 
 from plab.errors import PlabError
 
-_EGL_PLATFORM_DEVICE = 0x313F
 _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
 
 
@@ -52,7 +51,6 @@ def missing_graphics() -> str | None:
         return str(error)
     if sys.platform.startswith("linux") and _WINDOW not in os.environ:
         if not _egl_works():
-            # Otherwise VTK ends the process with a segmentation fault.
             return (
                 "pictures need OpenGL through EGL, which does not work here; on Debian and Ubuntu: "
                 "apt-get install libegl1 libgl1-mesa-dri"
@@ -62,21 +60,17 @@ def missing_graphics() -> str | None:
 
 
 def _egl_works() -> bool:
-    """Return whether EGL can open one of its devices; the software renderer counts as one."""
+    """Return whether EGL has a device; the software renderer counts as one."""
     try:
-        egl = ctypes.CDLL("libEGL.so.1")
+        # Without it VTK would end the process with a segmentation fault.
+        ctypes.CDLL("libEGL.so.1")
     except OSError:
         return False
-    integer, pointer = ctypes.c_uint, ctypes.c_void_p
-    egl.eglGetProcAddress.restype = pointer
-    query_devices = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
-    open_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
-    if not query_devices or not open_display:
-        return False
-    devices, count = (pointer * 16)(), ctypes.c_int(0)
-    query = ctypes.CFUNCTYPE(integer, integer, pointer, pointer)(query_devices)
-    query(len(devices), ctypes.addressof(devices), ctypes.addressof(count))
-    display = ctypes.CFUNCTYPE(pointer, integer, pointer, pointer)(open_display)
-    egl.eglInitialize.argtypes = [pointer, pointer, pointer]
-    found = (display(_EGL_PLATFORM_DEVICE, device, None) for device in devices[: count.value])
-    return any(egl.eglInitialize(each, None, None) for each in found)
+    from vtkmodules.vtkCommonCore import vtkLogger
+    from vtkmodules.vtkRenderingOpenGL2 import vtkEGLRenderWindow
+
+    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    count = vtkEGLRenderWindow().GetNumberOfDevices()
+    vtkLogger.SetStderrVerbosity(verbosity)
+    return count > 0

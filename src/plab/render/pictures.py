@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -17,11 +16,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from plab.config import Config, ConfigError
+from plab.files import UNFINISHED, complete_folder
 from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
 from plab.render.rollouts import RecordedRollout, record, record_all, result
+from plab.results import ResultsError
 from plab.scenes import Camera, SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError
@@ -42,8 +43,10 @@ _SET_EVERY = 2  # environment steps from one frame to the next, of a set
 
 
 _PAGE_SIZE = (480, 360)
-_UNFINISHED = ".unfinished-"
-_RENDER_ERRORS = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
+_RENDER_ERRORS = (
+    *(RenderError, ResultsError, ConfigError, SceneError, TargetError),
+    *(DeviceError, SimulationError),
+)
 
 
 Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
@@ -130,27 +133,21 @@ def save_contact_sheet(
     Raises:
         RenderError: If the file cannot be written.
     """
-    width, height = size[0] // 2, size[1]
-    text = max(10, height // 10)
-    left, gap = 8 * text, 2 * text
-    columns = max(map(len, rows.values()))
-    sheet = Image.new("RGB", (left + columns * (2 * width + gap), len(rows) * (height + gap)), PAPER)
-    for row, (task, recordings) in enumerate(rows.items()):
-        top = row * (height + gap)
-        _write(sheet, task, (left // 2, top + height // 2), round(1.2 * text))
-        for column, recording in enumerate(recordings):
-            at = left + column * (2 * width + gap)
-            sheet.paste(_start_and_target(recording, (width, height)), (at, top))
-            _write(sheet, recording.variant, (at + width, top + height + text // 2), text)
-    image = _with_palette(sheet, _palette([np.asarray(sheet)], _SHEET_COLORS))
+    frame = size[0] // 2, size[1]
+    tiles = [
+        (_start_and_target(recording, frame), f"{recording.task}, variant {recording.variant}")
+        for recordings in rows.values()
+        for recording in recordings
+    ]
     with _writing(path) as fresh:
-        image.save(fresh, optimize=True)
+        sheet = _tiled(tiles, max(map(len, rows.values())))
+        _with_palette(sheet, _SHEET_COLORS).save(fresh, optimize=True)
 
 
-def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> Image.Image:
+def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> np.ndarray:
     with closing(Renderer(recording.scene, recording.target_mass, size)) as renderer:
         start = renderer.frame(recording.x[0], recording.poses[0])
-        return Image.fromarray(np.concatenate([start, renderer.target(recording.poses[0])], axis=1))
+        return np.concatenate([start, renderer.target(recording.poses[0])], axis=1)
 
 
 def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tuple[int, int]) -> None:
@@ -164,23 +161,16 @@ def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tup
     Raises:
         RenderError: If the file cannot be written.
     """
-    width, height = size
-    text = max(10, height // 9)
-    across, down = _STRIP_FRAMES * width + text, height + 2 * text
-    rows = -(-len(recordings) // _STRIP_COLUMNS)
-    sheet = Image.new("RGB", (_STRIP_COLUMNS * across - text, rows * down), PAPER)
-    for number, recording in enumerate(recordings):
-        left, top = number // rows * across, number % rows * down
+    tiles = []
+    for recording in recordings:
         steps = np.linspace(0, len(recording.x) - 1, _STRIP_FRAMES).round().astype(int)
         camera = _camera(recording, size)
         with closing(Renderer(recording.scene, recording.target_mass, size, camera)) as renderer:
-            for column, step in enumerate(steps):
-                frame = renderer.frame(recording.x[step], recording.poses[step])
-                sheet.paste(Image.fromarray(frame), (left + column * width, top + 2 * text))
+            frames = [renderer.frame(recording.x[step], recording.poses[step]) for step in steps]
         caption = f"{recording.task}, variant {recording.variant}: score {recording.score:.2f}"
-        _write(sheet, caption, (left + _STRIP_FRAMES * width // 2, top + text), text)
+        tiles.append((np.concatenate(frames, axis=1), caption))
     with _writing(path) as fresh:
-        sheet.save(fresh, quality=_STRIP_QUALITY, optimize=True)
+        _tiled(tiles, _STRIP_COLUMNS).save(fresh, quality=_STRIP_QUALITY, optimize=True)
 
 
 def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
@@ -192,15 +182,16 @@ def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
     """Create the folder of a file, and yield a temporary path that replaces the file on success."""
-    fresh = path.with_name(f"{_UNFINISHED}{path.name}")
+    fresh = path.with_name(f"{UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield fresh
         if fresh.exists():
             fresh.replace(path)
     except OSError as error:
-        fresh.unlink(missing_ok=True)
         raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        fresh.unlink(missing_ok=True)
 
 
 # ---------------------------------------------------------------------------------------------------- formats
@@ -214,21 +205,15 @@ def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path:
         (renderer.target(first), "target"),
         (renderer.frame(recording.x[-1], last), f"after {steps} steps: score {recording.score:.2f}"),
     ]
-    width, height = renderer.size
-    text = max(12, height // 22)
-    sheet = Image.new("RGB", (len(panels) * (width + text) - text, height + 2 * text), PAPER)
-    for number, (picture, text_below) in enumerate(panels):
-        left = number * (width + text)
-        sheet.paste(Image.fromarray(picture), (left, 0))
-        _write(sheet, text_below, (left + width // 2, height + text), text)
-    sheet.save(path, optimize=True)
+    _tiled(panels, len(panels)).save(path, optimize=True)
 
 
 def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     frames = list(_frames(recording, renderer, every))
     # One palette for all frames, so that unchanged parts compress well.
-    palette = _palette([frames[0], frames[len(frames) // 2], frames[-1]], _FILM_COLORS)
-    images = [_with_palette(Image.fromarray(frame), palette) for frame in frames]
+    some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
+    palette = _with_palette(Image.fromarray(some), _FILM_COLORS)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration = [1000 * every // STEPS_PER_SECOND] * (len(images) - 1) + [round(1000 * _HOLD)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
 
@@ -245,6 +230,11 @@ def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: 
             writer.send(np.ascontiguousarray(frame))
         for _ in range(round(_HOLD * STEPS_PER_SECOND / every) - 1):
             writer.send(np.ascontiguousarray(frame))
+    try:
+        imageio_ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError:
+        # ffmpeg leaves a part of the film without an error.
+        raise OSError("the film is incomplete: is the disk full?") from None
 
 
 _WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
@@ -256,23 +246,22 @@ def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Itera
         yield renderer.frame(recording.x[step], recording.poses[step])
 
 
-def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
-    """Return a picture with a common palette for all pictures, each of shape [row, column, 3]."""
-    pixels = np.concatenate([picture.reshape(-1, 3) for picture in pictures])
-    seen, counts = np.unique(pixels, axis=0, return_counts=True)
-    # Weighted by the square root of the frequency, because the background dominates, but plasticine needs
-    # many shades.
-    weighted = np.repeat(seen, np.ceil(np.sqrt(counts)).astype(int), axis=0)
-    return Image.fromarray(weighted[None]).quantize(colors, method=Image.Quantize.MEDIANCUT, kmeans=1)
+def _with_palette(picture: Image.Image, colors: int) -> Image.Image:
+    return picture.quantize(colors, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
 
 
-def _with_palette(picture: Image.Image, palette: Image.Image) -> Image.Image:
-    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
-
-
-def _write(sheet: Image.Image, text: str, center: tuple[int, int], size: int) -> None:
-    """Write a line of some height [pixels] around a point."""
-    ImageDraw.Draw(sheet).text(center, text, fill=INK, font=ImageFont.load_default(size), anchor="mm")
+def _tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
+    """Return pictures of one size in rows, each above its caption."""
+    height, width, _ = tiles[0][0].shape
+    text = max(12, height // 22)
+    size = columns * (width + text) - text, -(-len(tiles) // columns) * (height + 2 * text)
+    sheet = Image.new("RGB", size, PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(text)
+    for number, (picture, caption) in enumerate(tiles):
+        left, top = number % columns * (width + text), number // columns * (height + 2 * text)
+        sheet.paste(Image.fromarray(picture), (left, top))
+        draw.text((left + width // 2, top + height + text), caption, fill=INK, font=font, anchor="mm")
+    return sheet
 
 
 # ------------------------------------------------------------------------------------------------------ runs
@@ -294,7 +283,7 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
     troubles: list[str] = []
     for place in {folder.parent for folder in wanted}:
         # Leftover pictures of killed processes.
-        for folder in place.glob(f"{_UNFINISHED}*"):
+        for folder in place.glob(f"{UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
         done = 0
@@ -305,7 +294,7 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
                 troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
                 continue
             for folder in folders:
-                with _complete_or_not(folder) as fresh:
+                with complete_folder(folder) as fresh:
                     films = {name for name, (_, film) in wanted[folder].items() if film}
                     save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _PAGE_SIZE, films)
                 done += 1
@@ -356,19 +345,3 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
         actions = np.stack([actions for _, _, actions in cases])
         made |= zip(names, record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
     return made
-
-
-@contextmanager
-def _complete_or_not(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces the destination on success."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder.parent))
-    except OSError as error:
-        raise RenderError(f"cannot write {folder}: {error.strerror or error}") from error
-    try:
-        yield fresh
-        fresh.chmod(0o755)
-        fresh.rename(folder)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)

@@ -12,8 +12,8 @@ from vtkmodules.vtkRenderingCore import vtkRenderer
 from plab.errors import ArgumentError
 from plab.objective import TARGET_MASS
 from plab.render.camera import scene_camera
-from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud, floor_light, hidden_share
-from plab.render.shapes import Part, manipulator_parts, pose_matrix, transform
+from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, Cloud, floor_light, hidden_share
+from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import Field, body_slices, body_surfaces, target_field
 from plab.scenes import Camera, Manipulator, Scene, sample_particles
 
@@ -35,7 +35,7 @@ _LIGHTS = (
 MANIPULATOR_COLOR = "#5a6470"
 TARGET_COLOR = "#2b8c9b"
 
-_CLAY = {"ambient": 0.26, "diffuse": 0.86, "specular": 0.05, "specular_power": 10}
+_CLAY = {"ambient": 0.25, "diffuse": 0.83, "specular": 0.05, "specular_power": 10}
 _METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25, "smooth_shading": True}
 _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "culling": "back"}
 _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
@@ -88,15 +88,13 @@ class Renderer:
         plotter = self._open_window()
         self._plotter: pv.Plotter | None = plotter
         self._light = _add_lights(plotter, self.camera)
-        self._floor = Floor(plotter, PAPER, INK, self.camera.pixel_size(size[1]))
+        self._floor = Floor(plotter)
         rest = sample_particles(scene)
         self._bodies = [
-            PlasticineSurface(
-                self._plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)]
-            )
+            _add_clay(plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)])
             for number, (surface, at) in enumerate(zip(self._surfaces, self._slices, strict=True))
         ]
-        self._manipulators = [Rigid(self._plotter, manipulator) for manipulator in scene.manipulators]
+        self._manipulators = [Rigid(plotter, manipulator) for manipulator in scene.manipulators]
         self._target: Target | None = None
         if target_mass is not None:
             self._target = Target(plotter, _layer_on_top(plotter), scene, target_mass, self.camera)
@@ -125,10 +123,9 @@ class Renderer:
         for rigid in self._manipulators:
             rigid.make_translucent(x, self.camera)
         fields = [surface.field(x[at]) for surface, at in zip(self._surfaces, self._slices, strict=True)]
-        ambient = AmbientLight(clouds)
         for body, field in zip(self._bodies, fields, strict=True):
-            body.set_shape(surface_mesh(field), ambient)
-        shown = [actor for thing in self._things if thing is not self._target for actor in thing.actors]
+            body.mapper.SetInputData(surface_mesh(field))
+        shown = [*self._bodies, *_actors(self._manipulators)]
         if self._target is not None:
             self._target.hide_covered_parts(fields)
             shown += self._target.ghost
@@ -151,10 +148,7 @@ class Renderer:
         self._place(poses)
         fixed = [rigid for rigid in self._manipulators if not rigid.moves]
         clouds = [self._target.cloud, *(rigid.cloud for rigid in fixed)]
-        solid = self._target.solid
-        solid.set_shape(self._target.mesh, AmbientLight(clouds))
-        things: list[PlasticineSurface | Rigid] = [solid, *fixed]
-        return self._draw([actor for thing in things for actor in thing.actors], clouds)
+        return self._draw([self._target.solid, *_actors(fixed)], clouds)
 
     def close(self) -> None:
         """Free the window; closing twice is allowed."""
@@ -174,16 +168,13 @@ class Renderer:
     def _draw(self, shown: Sequence[pv.Actor], clouds: Sequence[Cloud]) -> np.ndarray:
         """Draw some of the actors, and the shadows of clouds."""
         plotter = self._window()
-        for actor in (actor for thing in self._things for actor in thing.actors):
+        target = [] if self._target is None else [*self._target.ghost, self._target.solid]
+        for actor in (*self._bodies, *_actors(self._manipulators), *target):
             actor.visibility = any(actor is other for other in shown)
         self._floor.shade(floor_light(clouds, self._light))
         plotter.renderer.ResetCameraClippingRange()
         plotter.render()
         return plotter.screenshot(return_img=True)
-
-    @property
-    def _things(self) -> list[PlasticineSurface | Rigid | Target]:
-        return [*self._bodies, *self._manipulators, *([self._target] if self._target else [])]
 
     def _window(self) -> pv.Plotter:
         if self._plotter is None:
@@ -225,27 +216,8 @@ def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:
     return _LIGHTS[0][0] @ axes
 
 
-class PlasticineSurface:
-    """A surface of plasticine, darker in its corners.
-
-    Attributes:
-        actors: Its actor.
-    """
-
-    def __init__(self, plotter: pv.Plotter, mesh: pv.PolyData, color: str) -> None:
-        """Add it to a window, in the shape of a mesh."""
-        self._color = _rgb(color)
-        mesh["color"] = np.zeros((mesh.n_points, 3), np.uint8)
-        self.actors = [plotter.add_mesh(mesh, scalars="color", rgb=True, smooth_shading=True, **_CLAY)]
-
-    def set_shape(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
-        """Set the shape, with ambient light."""
-        if mesh.n_points:
-            light = ambient.at(mesh.points, mesh.point_normals)[:, None]
-            # Interreflections between walls of plasticine intensify its colour.
-            mesh["color"] = (255 * light * (self._color / 255) ** (1.5 - 0.5 * light)).astype(np.uint8)
-            mesh.set_active_scalars("color")
-        self.actors[0].mapper.SetInputData(mesh)
+def _add_clay(plotter: pv.Plotter, mesh: pv.PolyData, color: str) -> pv.Actor:
+    return plotter.add_mesh(mesh, color=color, smooth_shading=True, **_CLAY)
 
 
 class Rigid:
@@ -263,7 +235,7 @@ class Rigid:
         self._parts = manipulator_parts(manipulator)
         self._samples = [part.scatter(_SAMPLE_AREA) for part in self._parts]
         look: dict[str, Any] = {"color": MANIPULATOR_COLOR, "culling": "back", **_METAL}
-        self.actors = [plotter.add_mesh(part_mesh(part), **look) for part in self._parts]
+        self.actors = [plotter.add_mesh(part.mesh, **look) for part in self._parts]
 
     def place(self, pose: np.ndarray) -> None:
         """Set the pose, shape [8], and make it opaque."""
@@ -283,15 +255,17 @@ class Rigid:
             actor.prop.opacity = 1.0 - (1.0 - _MIN_OPACITY) * share
 
 
+def _actors(manipulators: Sequence[Rigid]) -> list[pv.Actor]:
+    return [actor for rigid in manipulators for actor in rigid.actors]
+
+
 class Target:
     """The target, translucent and solid.
 
     Attributes:
-        actors: Actors of both.
-        mesh: Its surface.
         cloud: Points that cast the solid's shadow.
         ghost: Translucent actors: outside plasticine, and inside.
-        solid: The solid.
+        solid: Actor of the solid.
     """
 
     def __init__(
@@ -299,23 +273,22 @@ class Target:
     ) -> None:
         """Add the target with a mass tensor, shape [n, n, n], to a window; ``inside`` is the layer of objects
         inside plasticine."""
-        self.mesh = target_mesh(scene, mass)
+        mesh = self._mesh = target_mesh(scene, mass)
         self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
-        self.solid = PlasticineSurface(plotter, self.mesh.copy(), TARGET_COLOR)
-        toward = camera.position - self.mesh.points
-        facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
+        self.solid = _add_clay(plotter, mesh.copy(), TARGET_COLOR)
+        toward = camera.position - mesh.points
+        facing = np.abs(np.sum(toward * mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
         # Transparent where it faces the camera, denser at the silhouette.
         self._alpha = 255 * (0.2 + 0.6 * (1.0 - facing) ** 1.5)
-        self._bubbles = [self.mesh.copy() for _ in range(2)]
+        self._bubbles = [mesh.copy() for _ in range(2)]
         for bubble in self._bubbles:
-            bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (self.mesh.n_points, 1)).astype(np.uint8)
+            bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (mesh.n_points, 1)).astype(np.uint8)
         self.ghost = [
             plotter.add_mesh(bubble, scalars="color", rgba=True, smooth_shading=True, **_GLASS)
             for bubble in self._bubbles
         ]
         plotter.renderer.RemoveActor(self.ghost[1])
         inside.AddActor(self.ghost[1])
-        self.actors = [*self.ghost, *self.solid.actors]
 
     def hide_covered_parts(self, bodies: Sequence[Field]) -> None:
         """Hide the target's surface where it runs along the plasticine's surface, but not where they
@@ -324,7 +297,7 @@ class Target:
         def density(points: np.ndarray) -> np.ndarray:
             return np.sum([field.at(points) for field in bodies], axis=0)
 
-        points, normals = self.mesh.points, self.mesh.point_normals
+        points, normals = self._mesh.points, self._mesh.point_normals
         here, ahead, behind = (density(points + way * _NEAR * normals) for way in (0.0, 1.0, -1.0))
         outside = np.clip((0.12 - np.maximum(here, behind)) / 0.1, 0.0, 1.0)
         inside = np.clip((np.minimum(here, ahead) - 0.92) / 0.07, 0.0, 1.0)
@@ -342,35 +315,28 @@ class Target:
 class Floor:
     """Floor with grid lines, ten per domain unit, that receives shadows."""
 
-    def __init__(self, plotter: pv.Plotter, paper: str, ink: str, pixel: float) -> None:
-        """Add it to a window; its lines, of the colour of complete darkness too, are fitted to the size of a
-        pixel [domain units]."""
-        self._paper, self._ink = _rgb(paper), _rgb(ink)
-        low, high = FLOOR_LOW, FLOOR_LOW + FLOOR_EDGE
-        corners = np.array([[low, 0, low], [low, 0, high], [high, 0, high], [high, 0, low]])
-        floor = pv.PolyData(corners, faces=_quads(np.arange(4)[None]))
-        floor.active_texture_coordinates = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.float32)
+    def __init__(self, plotter: pv.Plotter) -> None:
+        """Add it to a window."""
+        middle = FLOOR_LOW + FLOOR_EDGE / 2
+        place = {"center": (middle, 0.0, middle), "direction": (0.0, 1.0, 0.0)}
+        floor = pv.Plane(i_size=FLOOR_EDGE, j_size=FLOOR_EDGE, i_resolution=1, j_resolution=1, **place)
+        x, _, z = floor.points.T
+        floor.active_texture_coordinates = (np.stack([x, z], axis=1) - FLOOR_LOW) / FLOOR_EDGE
         self._texture = pv.Texture(np.zeros((2, 2, 3), np.uint8))
         self._texture.interpolate = True
         plotter.add_mesh(floor, texture=self._texture, lighting=False)
-        plotter.add_mesh(self._lines(0.5 * _LINE * pixel), color=ink, opacity=_LINE_OPACITY, lighting=False)
+        # Slightly above the floor, to be visible.
+        ends = [[x, 3e-3, z] for x in np.linspace(0.0, 1.0, 11) for z in (0.0, 1.0)]
+        lines = pv.line_segments_from_points(np.concatenate([ends, np.fliplr(ends)]))
+        plotter.add_mesh(lines, color=INK, opacity=_LINE_OPACITY, line_width=_LINE, lighting=False)
 
     def shade(self, light: np.ndarray) -> None:
         """Set the light, shape [z, x], from :func:`plab.render.shadows.floor_light`."""
         dark = _SHADOW * (1.0 - light)[..., None]
-        colors = self._paper + dark * (self._ink - self._paper)
+        colors = _rgb(PAPER) + dark * (_rgb(INK) - _rgb(PAPER))
         image = pv.ImageData(dimensions=(*light.shape[::-1], 1))
         image["color"] = colors.reshape(-1, 3).astype(np.uint8)
         self._texture.SetInputData(image)
-
-    def _lines(self, half: float) -> pv.PolyData:
-        """Return the grid lines, as narrow rectangles with a given half width."""
-        line = np.array([[-half, -half], [-half, 1 + half], [half, 1 + half], [half, -half]])
-        along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
-        both = np.concatenate([along, along[:, ::-1]])
-        corners = np.arange(len(both)).reshape(-1, 4)
-        # Slightly above the floor, to be visible.
-        return pv.PolyData(np.insert(both, 1, 4e-4, axis=1), faces=_quads(corners))
 
 
 def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.PolyData:
@@ -387,20 +353,9 @@ def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.
     return mesh.compute_normals(split_vertices=False, consistent_normals=False, auto_orient_normals=False)
 
 
-def part_mesh(part: Part) -> pv.PolyData:
-    """Return a part of a manipulator in its own frame, with normals, its edges sharp."""
-    mesh = pv.PolyData(part.vertices, faces=_quads(part.faces)).clean()
-    return mesh.compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=False)
-
-
 def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
     """Return the surface of a target with a mass tensor, shape [n, n, n]."""
     return surface_mesh(target_field(scene, mass), _TARGET_SMOOTHING)
-
-
-def _quads(corners: np.ndarray) -> np.ndarray:
-    """Return quadrilateral faces, shape [face, 4], in VTK's format."""
-    return np.insert(corners, 0, 4, axis=1).ravel()
 
 
 def _rgb(color: str) -> np.ndarray:

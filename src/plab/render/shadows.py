@@ -1,4 +1,4 @@
-"""Soft shadows, ambient occlusion, and visibility of bodies. Plain NumPy.
+"""Soft shadows on the floor, and the share of plasticine that a manipulator hides. Plain NumPy.
 
 Objects that cast shadows are point clouds; each point covers a small area.
 """
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from plab.scenes import Camera
@@ -25,16 +25,8 @@ _PIXELS = 192  # of the floor, per axis
 _LAYER_HEIGHTS = np.array([0.0, 0.06, 0.18, 0.45])
 _LAYER_BLURS = 0.008 + 0.16 * _LAYER_HEIGHTS  # extended light: high objects cast soft shadows
 
-_CELL = 0.02  # of the grid of covered space
-_BLUR = 1.1  # in cells
-_CELLS_AROUND = 5
-_OPACITY = 1.5
-_SAMPLE_DISTANCE = 0.03  # distance from a surface at which its light is sampled
-_FLAT_OCCLUSION = 0.06  # occlusion of a flat surface by itself
-_STRENGTH = 1.1
 _VIEW_CELL = 0.02  # of the visibility picture [domain units at the camera's target]
 _CONTACT = 0.1  # distance within which a manipulator acts on plasticine [domain units]
-_DARKEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -100,36 +92,3 @@ def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
     np.minimum.at(nearest, cell[:count], -back[:count])
     hides = np.unique(cell[count:][-back[count:] > nearest[cell[count:]]])
     return len(hides) / np.count_nonzero(np.isfinite(nearest))
-
-
-class AmbientLight:
-    """Ambient occlusion: light from all sides, reduced in corners."""
-
-    def __init__(self, clouds: Sequence[Cloud]) -> None:
-        """Compute the occupied space, including the space below the floor."""
-        points = np.concatenate([cloud.points for cloud in clouds])
-        self._low = points.min(axis=0) - _CELLS_AROUND * _CELL
-        shape = np.ceil((points.max(axis=0) - self._low) / _CELL).astype(int) + _CELLS_AROUND + 1
-        hidden = np.zeros(shape.prod())
-        for cloud in clouds:
-            i, j, k = np.rint((cloud.points - self._low) / _CELL).astype(np.int64).T
-            node = (i * shape[1] + j) * shape[2] + k
-            hidden += np.bincount(node, minlength=hidden.size) * (cloud.area / _CELL**2)
-        covered = (1.0 - np.exp(-_OPACITY * hidden)).astype(np.float32).reshape(shape)
-        height = self._low[1] + _CELL * np.arange(shape[1])
-        covered = np.maximum(covered, np.clip(0.5 - height / _CELL, 0.0, 1.0)[None, :, None])
-        self._covered = gaussian_filter(covered, _BLUR, mode="nearest")
-
-    def at(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the fraction of the light that reaches a surface.
-
-        Args:
-            points: Points of the surface [domain units], shape [point, 3].
-            normals: Outward normals, shape [point, 3].
-
-        Returns:
-            Fractions, shape [point].
-        """
-        seen = (points + _SAMPLE_DISTANCE * normals - self._low) / _CELL
-        covered = map_coordinates(self._covered, seen.T, order=1, mode="nearest")
-        return np.clip(1.0 - _STRENGTH * (covered - _FLAT_OCCLUSION), _DARKEST, 1.0)

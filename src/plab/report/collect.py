@@ -7,20 +7,20 @@ import functools
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import OBSERVATION_KEYS, Selection, one_protocol, require_possible
+from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
-from plab.results import Row, lookup, rows
+from plab.results import Row, rows
 from plab.results.running import held
-from plab.results.table import readable_rows, sources_of
+from plab.results.table import sources_of
 
 NAMES = ("task", "variant", "method", "seed")
 
@@ -166,7 +166,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         plab.config.ConfigError: If the selection cannot match any run.
         plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    found, unreadable = readable_rows(source)
+    found, unreadable = rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
@@ -338,20 +338,12 @@ def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         for name in config.keys() | first.keys()
         if config.get(name) != first.get(name)
     }
-    flat = [dict(_leaves({name: config[name] for name in config if name in unlike})) for config in configs]
+    flat = [dict(leaves({name: config[name] for name in config if name in unlike})) for config in configs]
     seen = {
-        key: {json.dumps(leaves.get(key)): leaves.get(key) for leaves in flat}
-        for key in dict.fromkeys(key for leaves in flat for key in leaves)
+        key: {json.dumps(own.get(key)): own.get(key) for own in flat}
+        for key in dict.fromkeys(key for own in flat for key in own)
     }
     return {key: list(values.values()) for key, values in seen.items() if len(values) > 1}
-
-
-def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
 
 
 def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Setting]]:
@@ -404,7 +396,7 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
     own = {key: lookup(config, key) for key in expected if key not in by_variant}
-    # None if the run is older than the setting.
+    # None where the run has no such setting.
     own = {key: None if value != value else value for key, value in own.items()}
     return {key: value for key, value in own.items() if value != expected[key]}
 
@@ -441,4 +433,4 @@ def _default_settings(method: str, protocol: str) -> dict[str, Any]:
     words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
     config = config_dict(load_config(words))
     names = ["protocol", "sim", *_SINGLE, *(["method"] if known else [])]
-    return dict(_leaves({name: config[name] for name in names}))
+    return dict(leaves({name: config[name] for name in names}))

@@ -13,18 +13,12 @@ from IPython.display import HTML, Image, Markdown, display
 from plab.config.selection import select
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
-from plab.report.formats import Table, aligned
 from plab.report.reference import Benchmark, measured
+from plab.report.tables import Table, aligned
 from plab.results import ResultsError
 from plab.results.examples import measurements, resolve
 
 _DPI = 180
-
-_COLOURS = {
-    **{"same": "same", "higher": "good", "lower": "bad"},
-    **{"undecided": "unsure", "too": "unsure", "no": "nothing"},
-}
-"""Class of a cell by the first word of its verdict."""
 
 
 def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
@@ -61,7 +55,7 @@ def say(text: str) -> None:
 
 
 def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
-    """Show a table of the report, or cells of text, with coloured verdicts."""
+    """Show a table of the report, or cells of text."""
     whole = table if isinstance(table, Table) else Table("", "", "", table, table, notes=list(notes))
     sides = ["number" if side == "r" else "" for side in aligned(whole.cells)]
     names = zip(whole.cells.columns, sides, strict=True)
@@ -75,9 +69,8 @@ def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
 
 
 def _cell(text: str, bold: bool, side: str) -> str:
-    kind = f"{_COLOURS.get(text.split(' ')[0], '')} {side}".strip()
     shown = f"<b>{escape(text)}</b>" if bold else escape(text)
-    return f'<td class="{kind}">{shown}</td>' if kind else f"<td>{shown}</td>"
+    return f'<td class="{side}">{shown}</td>' if side else f"<td>{shown}</td>"
 
 
 def show_figure(drawing: Drawing | None) -> None:

@@ -9,8 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from plab.report.templates import asset, render
+from plab.report.page import asset, render
 from plab.results import ResultsError
+from plab.results.run_file import replace_file
 
 NOTEBOOKS = ("reproduction", "speed", "accuracy", "anatomy")
 """Names of the notebooks."""
@@ -58,13 +59,12 @@ def execute(
     require_notebooks()
     import nbformat
 
-    out.mkdir(parents=True, exist_ok=True)
     pages = []
     for number, name in enumerate(names, start=1):
         notebook = _executed(name, parameters)
         files = {"ipynb": nbformat.writes(notebook), "html": _page(notebook, name, names)}
         for suffix, text in files.items():
-            (out / f"{name}.{suffix}").write_text(text, encoding="utf-8", newline="\n")
+            replace_file(out / f"{name}.{suffix}", text)
         pages.append(out / f"{name}.html")
         report(number, name)
     return pages

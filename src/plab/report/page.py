@@ -11,27 +11,34 @@ import hashlib
 import json
 import math
 import shlex
+import shutil
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from plab.report.collect import Runs, changed_settings
-from plab.report.media import Shown, best_of_tasks, best_runs, present
 from plab.report.methods import Method, method
-from plab.report.series import AXES, Band, Series, band, load_series
 from plab.report.statistics import (
+    AXES,
     Interval,
+    Rows,
+    Series,
     Summary,
+    band,
     improvement,
     interquartile_mean,
+    load_series,
     performance_profile,
     shared_strata,
 )
 from plab.report.tables import Cell, compare, ordered_tasks, settings_note
-from plab.report.templates import asset, render
 from plab.results.run_file import replace_file
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
@@ -66,7 +73,7 @@ class Page:
             runs: Our runs.
             out: Folder to write to.
             origin: Origin of the page: ``command``, ``digest``, ``plab``.
-            every_run: As for :func:`plab.report.media.best_runs`.
+            every_run: As for :func:`best_runs`.
         """
         self.shown = best_runs(runs, every_run=every_run)
         self._out, self._under_way = out, runs.under_way > 0
@@ -83,7 +90,7 @@ class Page:
             "columns": list(_COLUMNS),
             "every": _RELOAD_INTERVAL,
         }
-        best = {one.name: best_of_tasks([one])[one.task][1] for one in self.shown}
+        best = {one.name: one.best for one in self.shown}
         self._configurations: list[dict[str, Any]] = [
             {"name": f"{task}-v{variant}", "task": task, "variant": variant}
             | {"best": best.get(f"{task}-v{variant}")}
@@ -110,14 +117,13 @@ class Page:
 
     def _write_details(self, runs: Runs) -> None:
         folder = self._out / "data"
-        folder.mkdir(parents=True, exist_ok=True)
         # Left by a killed process.
         for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
             path.unlink()
         series = load_series(runs)
         for one in self.shown:
             text = json.dumps(_details(one, runs, series), separators=(",", ":"), allow_nan=False)
-            _write(folder / f"{one.name}.js", f"plab.receive({json.dumps(one.name)},{text});\n")
+            replace_file(folder / f"{one.name}.js", f"plab.receive({json.dumps(one.name)},{text});\n")
         for path in folder.glob("*-v*.js"):
             if path.stem not in {one.name for one in self.shown}:
                 path.unlink()
@@ -136,13 +142,8 @@ class Page:
         text = json.dumps(content | {"state": state}, separators=(",", ":"), allow_nan=False)
         # The only character that could end the enclosing script.
         html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
-        _write(self._out / "index.html", html)
-        _write(self._out / "data" / "state.js", f"plab.state({json.dumps(state)});\n")
-
-
-def _write(path: Path, text: str) -> None:
-    # Atomically, because a browser may read it at any time.
-    replace_file(path, text.encode(), sync=False)
+        replace_file(self._out / "index.html", html)
+        replace_file(self._out / "data" / "state.js", f"plab.state({json.dumps(state)});\n")
 
 
 def _look(look: Method, place: int) -> dict[str, str]:
@@ -210,12 +211,11 @@ def _incomplete(runs: Runs) -> list[str]:
 
 def _gallery(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     """Return the best run of each task."""
-    best = best_of_tasks(shown)
+    best = _best_of_tasks(shown)
     listed = []
     for task in ordered_tasks(list(best)):
-        one, name = best[task]
-        run = one.runs[name]
-        listed.append({"task": task, "name": one.name, "method": name, "seed": run["seed"]})
+        name, run = best[task].best, best[task].run
+        listed.append({"task": task, "name": best[task].name, "method": name, "seed": run["seed"]})
         listed[-1]["score"] = _finite(run["score"])
     return listed
 
@@ -256,7 +256,7 @@ def _details(shown: Shown, runs: Runs, series: Series) -> dict[str, Any]:
             "best": shown.runs[name]["config_hash"],
             "runs": [_run(row, runs.configs[index]) for index, row in rows.to_dict("index").items()],
             "curves": {
-                column: {axis: _curve(band(iterations, axis, column, floor=floor)) for axis in AXES}
+                column: {axis: _curve(iterations, axis, column, floor) for axis in AXES}
                 for column, floor in _COLUMNS.items()
             },
         }
@@ -296,15 +296,174 @@ def _override_text(value: Any) -> str:
     return json.dumps(value, separators=(",", ":")).replace("Infinity", ".inf")
 
 
-def _curve(drawn: Band | None) -> list[list[float]] | None:
-    """Return abscissae, means and standard deviations, subsampled evenly on a logarithmic axis."""
+def _curve(
+    iterations: Sequence[Rows], axis: str, column: str, floor: float | None
+) -> list[list[float]] | None:
+    """Return abscissae, means and standard deviations of some runs, with a few digits."""
+    drawn = band(iterations, axis, column, floor=floor, points=_POINTS)
     if drawn is None:
         return None
-    count = len(drawn.x)
-    low, high = max(drawn.x[0], 1e-9), drawn.x[-1]
-    at = np.searchsorted(drawn.x, np.geomspace(low, high, _POINTS)).clip(max=count - 1)
-    chosen = np.unique(np.concatenate([at, np.linspace(0, count - 1, _POINTS // 2).astype(int)]))
-    return [
-        [float(f"{value:.{_DIGITS}g}") for value in values[chosen]]
-        for values in (drawn.x, drawn.mean, drawn.std)
+    columns = (drawn.x, drawn.mean, drawn.std)
+    return [[float(f"{value:.{_DIGITS}g}") for value in values] for values in columns]
+
+
+# --------------------------------------------------------------------------------------- pictures and films
+
+FOLDER = "media"
+"""Folder of pictures, below that of the page."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A configuration and its displayed runs, one per method.
+
+    Attributes:
+        task: Name of the task.
+        variant: Name of the variant.
+        runs: Best run of each method: its row of the table of runs.
+        drawn: Methods with a picture.
+        films: Methods with a film.
+    """
+
+    task: str
+    variant: str
+    runs: Mapping[str, Mapping[str, Any]]
+    drawn: frozenset[str] = frozenset()
+    films: frozenset[str] = frozenset()
+
+    @property
+    def name(self) -> str:
+        """Name of the configuration, as in the names of result files."""
+        return f"{self.task}-v{self.variant}"
+
+    @property
+    def best(self) -> str:
+        """Method whose run has the highest score."""
+        return max(self.runs, key=lambda name: self.runs[name]["score"])
+
+    @property
+    def run(self) -> Mapping[str, Any]:
+        """Run of the method :attr:`best`."""
+        return self.runs[self.best]
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of its pictures, derived from the runs and films."""
+        # Repeated runs have the same configuration, but different actions.
+        drawn = [self.runs[name] for name in sorted(self.drawn)]
+        own = [[run["config_hash"], run["best_loss"]] for run in drawn]
+        text = json.dumps([own, sorted(self.films)])
+        return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+    def stem(self, method: str) -> str:
+        """Return the stem of the file names of a method's picture and film."""
+        return str(self.runs[method]["config_hash"])[:12]
+
+
+def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
+    """Return the run with the highest score of each configuration and method.
+
+    Args:
+        runs: Our runs.
+        every_run: Whether all runs have a picture and a film; otherwise only the best of each configuration
+            has a picture, and the best of each task a film.
+    """
+    found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    # Ties are broken by the hash, independent of the order of files.
+    table = runs.table.sort_values(["score", "config_hash"], ascending=[False, True])
+    for row in table.to_dict("records"):
+        found[row["task"], row["variant"]].setdefault(row["method"], row)
+    shown = [
+        Shown(task, variant, {name: own[name] for name in runs.methods if name in own})
+        for (task, variant), own in sorted(found.items())
     ]
+    if every_run:
+        return [replace(one, drawn=frozenset(one.runs), films=frozenset(one.runs)) for one in shown]
+    filmed = {one.name for one in _best_of_tasks(shown).values()}
+    return [
+        replace(one, drawn=frozenset([one.best]), films=frozenset([one.best] if one.name in filmed else []))
+        for one in shown
+    ]
+
+
+def _best_of_tasks(shown: Sequence[Shown]) -> dict[str, Shown]:
+    """Return the configuration of the run with the highest score of each task, of several the first."""
+    best: dict[str, Shown] = {}
+    for one in shown:
+        if one.task not in best or one.run["score"] > best[one.task].run["score"]:
+            best[one.task] = one
+    return best
+
+
+def present(shown: Shown, out: Path) -> dict[str, str]:
+    """Return the existing pictures of a configuration.
+
+    Args:
+        shown: The configuration.
+        out: Folder of the page.
+
+    Returns:
+        Paths relative to ``out`` by subject: ``start``, ``target``, ``<method>``, ``<method> film``.
+    """
+    folder = out / FOLDER / shown.folder
+    names = {"start": "start.webp", "target": "target.webp"}
+    names |= {method: f"{shown.stem(method)}.webp" for method in shown.drawn}
+    names |= {f"{method} film": f"{shown.stem(method)}.mp4" for method in shown.films}
+    there = {what: folder / name for what, name in names.items()}
+    return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
+
+
+def missing_pictures(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
+    """Return the pictures to draw.
+
+    Args:
+        shown: The configurations.
+        out: Folder of the page.
+
+    Returns:
+        For missing folders, result files by the stems of picture names, and whether each has a film.
+    """
+    folders = {out / FOLDER / one.folder: one for one in shown}
+    return {
+        folder: {
+            one.stem(name): (Path(one.runs[name]["path"]), name in one.films) for name in sorted(one.drawn)
+        }
+        for folder, one in folders.items()
+        if not folder.is_dir()
+    }
+
+
+def remove_earlier(shown: Sequence[Shown], out: Path) -> None:
+    """Remove pictures of runs that have been surpassed, once those of the best runs exist."""
+    for one in shown:
+        current = out / FOLDER / one.folder
+        if current.is_dir():
+            for folder in (out / FOLDER).glob(f"{one.name}-{'[0-9a-f]' * 8}"):
+                if folder != current:
+                    shutil.rmtree(folder)
+
+
+# -------------------------------------------------------------------------------------------------- templates
+
+_OWN = "plab.report"
+
+
+def asset(name: str, package: str = _OWN) -> str:
+    """Return a file of a package's folder ``web``."""
+    return (files(package) / "web" / name).read_text(encoding="utf-8")
+
+
+def render(template: str, package: str = _OWN, **values: Any) -> str:
+    """Return a page.
+
+    Args:
+        template: Template that extends ``base.html``.
+        package: Package with the template in its folder ``web``.
+        **values: Variables of the template.
+    """
+
+    def load(file: str) -> str:
+        return asset(file, package if file == template else _OWN)
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, loader=FunctionLoader(load))
+    return environment.get_template(template).render(**values)

@@ -1,24 +1,104 @@
-"""Tables of results: scores per task and configuration, solvability, equal budgets, times per step."""
+"""Tables of results: scores per task and configuration, solvability, equal budgets, times per step; and of
+hyper-parameters, read from ``conf/method/``.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
 
 from plab.config.families import GRADIENT, RL
-from plab.config.suite import SUITE_VARIANTS
+from plab.config.suite import SUITE_VARIANTS, conf_folder, shipped_file
 from plab.report.collect import Runs
-from plab.report.formats import NOTHING, Table, mean_and_std, number
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, origin, paper_table
-from plab.report.series import BUDGETS, Series, at_budgets, scores_at, strata_of
-from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
+from plab.report.statistics import (
+    BUDGETS,
+    CONFIDENCE,
+    Interval,
+    Series,
+    Summary,
+    at_budgets,
+    scores_at,
+    strata_of,
+    stratified_difference,
+    summarise,
+)
+
+NOTHING = "\N{EN DASH}"
+"""Placeholder for missing numbers."""
+
+MINUS = "\N{MINUS SIGN}"
+"""Sign of negative numbers."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table.
+
+    Attributes:
+        name: Name of its files.
+        form: ``ours``, ``paper`` or ``comparison``: its folder.
+        title: Heading.
+        cells: Text of the table.
+        data: CSV rows with all digits, one per number or group of numbers.
+        bold: Mask of bold cells, of the shape of ``cells``; None if none is.
+        notes: Notes on the contents and the provenance of the table.
+        long: Whether it may be longer than a page.
+    """
+
+    name: str
+    form: str
+    title: str
+    cells: pd.DataFrame
+    data: pd.DataFrame
+    bold: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+    long: bool = False
+
+    @property
+    def file(self) -> Path:
+        """Path of its files below the folder of tables, without suffix."""
+        return Path(self.form) / self.name
+
+
+def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
+    """Format a number with a minus sign instead of a hyphen; a dash if it is missing."""
+    if math.isnan(value):
+        return NOTHING
+    # Without a minus sign for values rounded to zero.
+    rounded = round(value, decimals) + 0.0
+    text = f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
+    return text.replace("-", MINUS)
+
+
+def aligned(cells: pd.DataFrame) -> list[str]:
+    """Return the alignment of each column: ``r`` for numbers, ``l`` otherwise."""
+    columns = ([str(text) for text in cells.iloc[:, k]] for k in range(cells.shape[1]))
+    known = ([text for text in texts if text not in ("", NOTHING)] for texts in columns)
+    return ["r" if texts and all(map(_NUMBER.match, texts)) else "l" for texts in known]
+
+
+_NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
+"""Pattern of cells with numbers: a share of runs, an interval, a mean with its spread, a unit."""
+
+
+def mean_and_std(summary: Summary, decimals: int = 2) -> str:
+    """Format a mean with its standard deviation, omitted for a single number."""
+    mean = number(summary.mean, decimals)
+    return mean if summary.count < 2 else f"{mean} ± {number(summary.std, decimals)}"
+
 
 _INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
 _BOLD = "Bold: best RL method and best gradient method."
@@ -306,43 +386,43 @@ _DEMONSTRATIONS = "Normalised incremental IoU of the best known actions, replaye
 
 def solvability(runs: Runs) -> list[Table]:
     """Return the scores of the demonstrations beside those of the paper's best method."""
-    known = demonstration_scores().set_index(["task", "variant"])["score"]
+    grid = itertools.product(ordered_tasks(runs.tasks), runs.variants)
     paper = paper_table("iou_per_configuration")
-    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
-    rows, cells = [], []
-    for key in itertools.product(ordered_tasks(runs.tasks), runs.variants):
-        score = float(known.get(key, np.nan))
-        theirs, name, printed = summarise([]), "", NOTHING
-        if key in best.index:
-            name = best.loc[key, "method"]
-            mean, std = float(best.loc[key, "iou_mean"]), float(best.loc[key, "iou_std"])
-            theirs = Summary(mean, std, PAPER_SEED_COUNT)
-            printed = f"{mean_and_std(theirs)} ({method(name).label})"
-        # A replay is deterministic, so the interval is the paper's.
-        gap = stratified_difference([Summary(score, 0.0, 0 if np.isnan(score) else 2)], [theirs])
-        which = {"task": key[0], "variant": key[1]}
-        rows.append(
-            which
-            | {"score": score, "paper_method": name, "paper_mean": theirs.mean, "paper_std": theirs.std}
-            | {"difference": gap.value, "low": gap.low, "high": gap.high}
-        )
-        shown = {"demonstration": number(score), "paper, best method": printed}
-        cells.append(which | shown | {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)})
-    data = pd.DataFrame(rows)
+    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()]
+    names = {"method": "paper_method", "iou_mean": "paper_mean", "iou_std": "paper_std"}
+    data = pd.DataFrame(grid, columns=["task", "variant"]).merge(demonstration_scores(), "left")
+    data = data.merge(best.rename(columns=names), "left").fillna({"paper_method": ""})
+    columns = data[["score", "paper_mean", "paper_std"]].itertuples(index=False)
+    # A replay has no spread: all of the interval is the paper's.
+    sides = [
+        (Summary(score, 0.0, 2 * (score == score)), Summary(mean, std, PAPER_SEED_COUNT * (mean == mean)))
+        for score, mean, std in columns
+    ]
+    gaps = [stratified_difference([ours], [theirs]) for ours, theirs in sides]
+    printed = [
+        f"{mean_and_std(theirs)} ({method(name).label})" if theirs.count else NOTHING
+        for (_, theirs), name in zip(sides, data["paper_method"], strict=True)
+    ]
+    cells = data[["task", "variant"]].assign(
+        **{
+            "demonstration": data["score"].map(number),
+            "paper, best method": printed,
+            "difference": [number(gap.value, sign=True) for gap in gaps],
+            INTERVAL: [ends(gap) for gap in gaps],
+        }
+    )
+    data[["difference", "low", "high"]] = [(gap.value, gap.low, gap.high) for gap in gaps]
     notes = [
         _DEMONSTRATIONS,
         "Our targets are made from their parameters or by scripts, the paper's are files, so the two columns "
         "judge somewhat different goals. The interval is Student's t over the paper's seeds.",
     ]
-    title, theirs_title = (
-        "What the reference demonstrations reach",
-        "What the best method of the paper reaches",
-    )
+    ours, theirs = "What the reference demonstrations reach", "What the best method of the paper reaches"
     compared = "Demonstrations beside the best method of the paper"
     return [
-        _solvability_grid(data, "ours", "score", title, _DEMONSTRATIONS),
-        _solvability_grid(data, "paper", "paper_mean", theirs_title, "Mean over seeds."),
-        Table("solvability", "comparison", compared, pd.DataFrame(cells), data, None, notes, True),
+        _solvability_grid(data, "ours", "score", ours, _DEMONSTRATIONS),
+        _solvability_grid(data, "paper", "paper_mean", theirs, "Mean over seeds."),
+        Table("solvability", "comparison", compared, cells, data, None, notes, True),
     ]
 
 
@@ -498,3 +578,106 @@ def _compared_times(times: Sequence[tuple[str, str, str, Summary, float]], more:
     numbers = pd.DataFrame(data, columns=None if data else ["task", "measured", "what", "measurements", "ms"])
     title = "Time per environment step, compared"
     return Table("timing", "comparison", title, table, numbers, None, notes, True)
+
+
+# ------------------------------------------------------------------------------------------ hyper-parameters
+
+RL_METHODS = ("sac", "td3", "ppo")
+
+_GRADIENT_KEYS = {
+    "adam": ("softness", "lr", "betas", "eps", "iterations", "action_init"),
+    "gd": ("softness", "lr", "momentum", "iterations", "action_init"),
+    "adam_h": ("lr", "betas", "eps", "iterations", "action_init"),
+}
+"""Effective settings by method."""
+
+
+def hyperparameters() -> list[Table]:
+    """Return the settings of all methods: ours, the paper's, and a comparison."""
+    data = pd.DataFrame([*_rl_rows(), *_gradient_rows()])
+    shown = data.replace("", NOTHING).assign(method=data["method"].map(lambda name: method(name).label))
+    ours = shown[["method", "key", "plab", "remark"]].rename(columns={"plab": "value"})
+    names = {"paper": "value", "paper remark": "remark"}
+    theirs = shown[["method", "key", "paper", "paper remark"]].rename(columns=names)
+    both = shown[["method", "key", "plab", "paper"]]
+    bold = np.zeros(both.shape, dtype=bool)
+    bold[:, 2:] = ((data["plab"] != data["paper"]) & data["paper"].ne("")).to_numpy()[:, None]
+    our_note = "As in conf/method/, profile release: the authors' code."
+    their_note = (
+        "RL methods: conf/method/, profile paper, as far as the paper prints it. Gradient methods: the "
+        "authors' code, and the paper's decay rate of the soft contact."
+    )
+    note = "Bold: not the same. A dash: not printed."
+    return [
+        Table(
+            "hyperparameters", form, f"Hyper-parameters, {whose}", cells, data[columns], bolds, [said], True
+        )
+        for form, whose, cells, columns, bolds, said in (
+            ("ours", "plab", ours, ["method", "key", "plab"], None, our_note),
+            ("paper", "the paper", theirs, ["method", "key", "paper"], None, their_note),
+            ("comparison", "compared", both, list(data), bold, note),
+        )
+    ]
+
+
+def _rl_rows() -> Iterator[dict[str, str]]:
+    for name in RL_METHODS:
+        text = (conf_folder() / "method" / f"{name}.yaml").read_text(encoding="utf-8")
+        profiles = yaml.safe_load(text)["profiles"]
+        remarks, printed = _comments(text, "release"), _comments(text, "paper")
+        for key, value in profiles["release"].items():
+            remark = printed.get(key, "")
+            is_printed = "printed" in remark and not remark.startswith("not printed")
+            yield {
+                "method": name,
+                "key": key,
+                "plab": _value(value),
+                "paper": _value(profiles["paper"][key]) if is_printed else "",
+                "remark": remarks.get(key, ""),
+                "paper remark": remark,
+            }
+
+
+def _gradient_rows() -> Iterator[dict[str, str]]:
+    # Composing needs Hydra.
+    from plab.config import load_config
+
+    paper = paper_table("gradient_settings").set_index(["method", "key"])["value"]
+    remarks = _comments((conf_folder() / "method" / "adam.yaml").read_text(encoding="utf-8"), None)
+    for name, keys in _GRADIENT_KEYS.items():
+        content = load_config([f"method={name}"]).method
+        for key in keys:
+            value = getattr(content, key)
+            rates = shipped_file("method", name)["lr_by_task"]["plab"] if key == "lr" else {}
+            exceptions = [f"; {_value(rate)} on {task}" for task, rate in rates.items() if rate != value]
+            yield {
+                "method": name,
+                "key": key,
+                "plab": _value(value),
+                "paper": _value(yaml.safe_load(str(paper[name, key]))),
+                "remark": remarks.get(key, "") + "".join(exceptions),
+                "paper remark": "",
+            }
+
+
+def _comments(text: str, profile: str | None) -> dict[str, str]:
+    """Return the comment on each key of a file, or of one of its profiles."""
+    indent = ""
+    if profile is not None:
+        indent = "    "
+        text = re.split(r"\n(?!    )", text.split(f"\n  {profile}:", 1)[1], maxsplit=1)[0]
+    return dict(re.findall(rf"^{indent}(\w+):.*?#\s*(.*)", text, re.MULTILINE))
+
+
+def _value(value: Any) -> str:
+    """Format a number without unnecessary digits."""
+    if isinstance(value, list):
+        return f"[{', '.join(_value(item) for item in value)}]"
+    if value is None or isinstance(value, bool):
+        return "none" if value is None else str(value).lower()
+    try:
+        # YAML parses 1e-8 as text.
+        number = float(value)
+    except ValueError:
+        return str(value)
+    return str(int(number)) if number.is_integer() else f"{number:g}".replace("e-0", "e-")

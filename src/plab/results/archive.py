@@ -21,7 +21,7 @@ import numpy as np
 from plab.config.run import member_name
 from plab.results.run_file import encode, read, replace_file
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult
-from plab.results.table import Row, readable_rows, rows
+from plab.results.table import Row, rows
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def pack(
     archive = Path(archive)
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
-    found, unreadable = readable_rows(source)
+    found, unreadable = rows(source)
     chosen: dict[str, Row] = {}
     for row in filter(wanted or _finished, found):
         name = _member(row).as_posix()
@@ -86,7 +86,12 @@ def pack(
         )
     members = []
     for name, row in sorted(chosen.items()):
-        run = read(row.path)
+        try:
+            run = read(row.path)
+        except ResultsError as error:
+            # Of its mass tensors or its state: rows are read without them.
+            unreadable.append(error)
+            continue
         run = replace(
             run if digits is None else _rounded(run, digits),
             # Paths are meaningless on other computers.
@@ -97,7 +102,7 @@ def pack(
         members.append((name, encode(run, compress=False)))
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
-    replace_file(archive, content, sync=True, folders=True)
+    replace_file(archive, content, sync=True)
     return ArchiveSummary(len(members), len(content), size, unreadable)
 
 
@@ -151,7 +156,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
             raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
         if path.exists():
             continue
-        replace_file(path, encode(read(row.path), compress=True), sync=False, folders=True)
+        replace_file(path, encode(read(row.path), compress=True))
         written += 1
     return written, len(found) - written
 

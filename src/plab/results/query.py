@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from plab.config.selection import Selection, lookup
+from plab.config.selection import Selection, leaves, lookup
 from plab.errors import ArgumentError
 from plab.results.schema import ResultsError
-from plab.results.table import COLUMNS, Row, read_curves, readable_rows, sources_of, warn_of
+from plab.results.table import COLUMNS, Row, read_curves, rows, sources_of, warn_of
 
 if TYPE_CHECKING:
     import duckdb
@@ -89,7 +89,7 @@ def scores(
         ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    found, unreadable = readable_rows(source)
+    found, unreadable = rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
     columns = list(dict.fromkeys((*_NAMES, *_SETTINGS, "status", "score", *keys)))
     table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
@@ -134,7 +134,7 @@ def _connected(
 ) -> tuple[duckdb.DuckDBPyConnection, list[ResultsError]]:
     import duckdb
 
-    found, unreadable = readable_rows(sources)
+    found, unreadable = rows(sources)
     tables = _tables(found, sources)
     if iterations:
         curves = read_curves(row.path for row in found)
@@ -150,34 +150,25 @@ def _connected(
 
 def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
     """Return all tables except ``iterations``."""
-    rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
+    lines: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
     for run, row in enumerate(found):
         values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
         values["folder"] = next(str(one) for one in sources if row.path.is_relative_to(one))
-        rows["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
-        for key, value in _leaves(row.config, ""):
+        lines["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
+        for key, value in leaves(row.config):
             number = float(value) if isinstance(value, int | float) else None
             plain = value is None or isinstance(value, str)
-            rows["config"].append((run, key, value if plain else json.dumps(value), number))
+            lines["config"].append((run, key, value if plain else json.dumps(value), number))
         for name, value in row.values.items():
             if name.startswith("seconds_"):
-                rows["times"].append((run, name.removeprefix("seconds_"), value))
+                lines["times"].append((run, name.removeprefix("seconds_"), value))
             elif value == value and name not in _NO_EVALUATION:
-                rows["evaluations"].append((run, "score" if name == "score_best" else name, value))
-    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in rows.items()}
+                lines["evaluations"].append((run, "score" if name == "score_best" else name, value))
+    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in lines.items()}
     types = dict.fromkeys(_TEXTS, "string") | dict.fromkeys(_NUMBERS, "float64")
     tables["runs"] = tables["runs"].astype(types)
     tables["config"] = tables["config"].astype({"number": "float64"})
     return tables
-
-
-def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield the dotted keys of a configuration with their values."""
-    if not isinstance(node, Mapping):
-        yield key, node
-        return
-    for name, value in node.items():
-        yield from _leaves(value, f"{key}.{name}" if key else name)
 
 
 def _value(row: Row, name: str) -> Any:

@@ -65,18 +65,21 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
     replace_file(path, encode(result, compress=compress), sync=compress)
 
 
-def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = False) -> None:
-    """Create or replace a file in one atomic step.
+def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> None:
+    """Create or replace a file in one atomic step, and the folders that it is in.
 
-    With ``sync`` flush it to disk, with ``folders`` create its parent folders.
+    Args:
+        path: The file.
+        content: Its content; text in UTF-8.
+        sync: Wait until the disk has it.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
     """
+    content = content.encode() if isinstance(content, str) else content
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
-        if folders:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             file.write(content)
             if sync:

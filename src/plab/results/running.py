@@ -217,7 +217,7 @@ class RunFile:
         content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
         # A full disk fails the run at its next checkpoint, not here.
         with suppress(ResultsError):
-            replace_file(self._progress, json.dumps(content, default=float).encode(), sync=False)
+            replace_file(self._progress, json.dumps(content, default=float))
 
     def close(self, status: str, message: str) -> None:
         """Mark an unfinished run ``failed`` or ``stopped``, and keep its state in the partial file."""

@@ -113,7 +113,7 @@ def load(
         or that of the last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
 
     Raises:
-        ResultsError: If ``source`` does not exist, or ``keys`` is a text.
+        ResultsError: As for :func:`rows`, or if ``keys`` is a text.
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
@@ -138,23 +138,15 @@ def rows(
     Files are read in full first, so that their iterations and actions are known to be readable.
 
     Raises:
-        ResultsError: If ``source`` does not exist.
-    """
-    entries = [entry for root in sources_of(source) for entry in _all_rows(root, index)]
-    found = [entry for entry in entries if isinstance(entry, Row)]
-    return _without_repetitions(found), [entry for entry in entries if isinstance(entry, ResultsError)]
-
-
-def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
-    """As :func:`rows`, but raise if files are requested and none can be read.
-
-    Raises:
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    found, unreadable = rows(source)
-    if unreadable and not found and not any(root.is_dir() for root in sources_of(source)):
+    roots = sources_of(source)
+    entries = [entry for root in roots for entry in _all_rows(root, index)]
+    found = [entry for entry in entries if isinstance(entry, Row)]
+    unreadable = [entry for entry in entries if isinstance(entry, ResultsError)]
+    if unreadable and not found and not any(root.is_dir() for root in roots):
         raise unreadable[0]
-    return found, unreadable
+    return _without_repetitions(found), unreadable
 
 
 def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -16,7 +16,7 @@ from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
 from plab.results.running import held
-from plab.results.table import readable_rows
+from plab.results.table import rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""
@@ -152,7 +152,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
         ResultsError: If ``source`` does not exist, or is an unreadable file or archive.
         ArgumentError: If there are runs of several protocols, or the selection cannot match any run.
     """
-    found, unreadable = readable_rows(source)
+    found, unreadable = rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)

@@ -4,6 +4,6 @@
 leaderboard`` generates a page; see docs/submissions.md.
 """
 
-from plab.submissions.recorder import record
+from plab.submissions.collecting import record
 
 __all__ = ["record"]

@@ -16,10 +16,10 @@ from plab.config.families import GRADIENT
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
-from plab.report.series import BUDGETS
+from plab.report.statistics import BUDGETS
 from plab.results import ResultsError, Row
 from plab.results.examples import example_archive
-from plab.results.table import readable_rows
+from plab.results.table import rows
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.submission import (
     UNSEEN,
@@ -102,20 +102,22 @@ _ORIGIN = {
     "release": "Start, numbers and floor are those of the authors' code (protocol=release)",
 }
 _TARGETS = {
-    "suite": "the targets of plab's own recipes",
-    "unseen": f"drawn starts and targets ({UNSEEN[0]} to {UNSEEN[-1]}) of each task",
-    "authors": "the authors' target files",
+    "suite": ("plab's suite", "the targets of plab's own recipes", len(SUITE_VARIANTS)),
+    "unseen": (
+        "Unseen configurations",
+        f"drawn starts and targets ({UNSEEN[0]} to {UNSEEN[-1]}) of each task",
+        len(UNSEEN),
+    ),
+    "authors": ("The authors' suite", "the authors' target files", len(SUITE_VARIANTS)),
 }
-_TITLES: dict[TableKey, str] = {
-    ("suite", "plab"): "plab's suite",
-    ("unseen", "plab"): "Unseen configurations",
-    ("authors", "plab"): "The authors' suite",
-    ("authors", "release"): "The authors' suite on its terms",
-    ("suite", "release"): "plab's suite on the authors' terms",
-    ("unseen", "release"): "Unseen configurations on the authors' terms",
+"""Heading, origin of the targets, and variants of a task, by set of configurations."""
+
+_TABLES: dict[TableKey, str] = {
+    **{(kind, "plab"): "" for kind in _TARGETS},
+    ("authors", "release"): " on its terms",
+    **{(kind, "release"): " on the authors' terms" for kind in ("suite", "unseen")},
 }
-_SHOWN_IF_EMPTY = 4
-"""Number of tables shown even if empty, from the first on."""
+"""Ends of headings, in the order of the page; the first four tables are shown without lines, too."""
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
@@ -140,28 +142,24 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     tables["suite", "plab"] += _own_runs("example", "suite")
     tables["authors", "plab"] += _own_runs("targets", "authors")
     tables["authors", "release"] += _own_runs("release", "authors")
-    sections = [
-        _table(title, f"{_ORIGIN[terms]}; {_TARGETS[kind]}. {_PLAYED}", kind, tables[kind, terms])
-        for number, ((kind, terms), title) in enumerate(_TITLES.items())
-        if tables[kind, terms] or number < _SHOWN_IF_EMPTY
-    ]
+    sections = []
+    for number, ((kind, terms), ending) in enumerate(_TABLES.items()):
+        title, targets, _ = _TARGETS[kind]
+        if tables[kind, terms] or number < 4:
+            protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
+            sections.append(_table(f"{title}{ending}", protocol, kind, tables[kind, terms]))
     return Board((*sections, _paper()), tuple(left_out))
 
 
 def _table(title: str, protocol: str, kind: str, lines: Iterable[Line]) -> BoardTable:
     best_first = tuple(sorted(lines, key=lambda line: (-line.score, line.card.name)))
-    return BoardTable(title, protocol, len(suite_tasks()) * _variants(kind), best_first)
-
-
-def _variants(kind: str) -> int:
-    """Return the number of variants of a task in a set of configurations."""
-    return len(UNSEEN if kind == "unseen" else SUITE_VARIANTS)
+    return BoardTable(title, protocol, len(suite_tasks()) * _TARGETS[kind][-1], best_first)
 
 
 def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> Line:
     """Summarise the results of a method for a table."""
     table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
-    each = _variants(kind)
+    each = _TARGETS[kind][-1]
     expected = len(suite_tasks()) * each
 
     def best(rows: pd.DataFrame) -> pd.DataFrame:
@@ -231,7 +229,7 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
 def _runs(archive: str) -> dict[Card, list[Row]]:
     """Return the runs of gradient methods with seed 0 in a bundled archive, by method."""
     groups: dict[Card, list[Row]] = defaultdict(list)
-    for row in readable_rows(example_archive(archive))[0]:
+    for row in rows(example_archive(archive))[0]:
         look = method(row.values["method"])
         if row.values["seed"] == 0 and look.kind == GRADIENT:
             groups[replace(OWN, name=look.label)].append(row)
@@ -251,12 +249,12 @@ def _point(row: Row, steps: int, score: str) -> Point:
 def _paper() -> BoardTable:
     """Return the paper's table, with comparable runs of plab."""
     lines = []
-    for name, rows in paper_table("iou_per_configuration").groupby("method", sort=False):
+    for name, own in paper_table("iou_per_configuration").groupby("method", sort=False):
         look = method(str(name))
         gradient = look.kind == GRADIENT
         card = replace(PAPER, name=look.label, gradient=gradient)
-        points = rows[["task", "variant"]].assign(
-            steps=_PAPER_STEPS[gradient], score=rows["iou_mean"], exact=math.nan
+        points = own[["task", "variant"]].assign(
+            steps=_PAPER_STEPS[gradient], score=own["iou_mean"], exact=math.nan
         )
         track = "plans" if gradient else "policies"
         lines.append(_line(card, track, "printed", "authors", points.itertuples(index=False, name=None)))

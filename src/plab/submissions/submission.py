@@ -22,10 +22,10 @@ import yaml
 import plab
 from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.files import UnreadableError, member_bytes, one_line, opened_zip
+from plab.files import UnreadableError, array_in, one_line, read_members
 from plab.results import ResultsError
 from plab.results.archive import zipped
-from plab.results.run_file import replace_file
+from plab.results.run_file import explained, replace_file
 from plab.targets import load_release_target
 from plab.targets.store import PHYSICS_VERSION
 
@@ -236,55 +236,21 @@ class Submission:
 
 # ------------------------------------------------------------------------------------------------ fields
 
-Rules = Mapping[str, tuple[Any, str, str]]
-"""Type, pattern and description of the value of each key; the pattern of a list is that of its entries."""
-
-_STEPS = int, r"\d{1,15}", "a whole number of environment steps"
-_SHA_256 = str, "[0-9a-f]{64}", "a SHA-256"
-_CARD_RULES: Rules = {
+_CARD_RULES: Mapping[str, tuple[type, str, str]] = {
     "name": (str, r"\S.{0,59}", "a line of at most 60 characters"),
     "authors": (list, r"\S.{0,59}", "a list of 1 to 50 names"),
     "link": (str, r"https?://[^\s\"'<>]{1,290}", "an address that begins with https:// or http://"),
-    "budget": _STEPS,
+    "budget": (int, r"\d{1,15}", "a whole number of environment steps"),
     "hardware": (str, r"\S.{0,199}", "a line of at most 200 characters"),
     "gradient": (bool, "True|False", "true or false"),
     "description": (str, ".{0,500}", "a line of at most 500 characters"),
 }
-_MANIFEST_RULES: Rules = {
-    "format": (int, r"\d{1,9}", "a number"),
-    "plab": (str, r"[\w.+-]{1,40}", "a version of plab"),
-    "physics": (int, r"\d{1,9}", "a number"),
-}
-_ENTRY_RULES: Rules = {
-    "task": (str, "|".join(suite_tasks()), "a task of the suite"),
-    "variant": (str, "|".join(VARIANTS), f"one of 1 to 5, {UNSEEN[0]} to {UNSEEN[-1]}"),
-    "targets": (str, "|".join(TARGETS), " or ".join(TARGETS)),
-    "terms": (str, "|".join(TERMS), " or ".join(TERMS)),
-    "scene": _SHA_256,
-    "target": _SHA_256,
-    "steps": _STEPS,
-    "score": (int | float, r"[01]|0\.\d+|1\.0|\d(\.\d+)?e-\d+", "a number in [0, 1]"),
-    "file": (
-        str,
-        r"actions/[\w.-]+\.npy|policies/[\w.-]+\.(pt|onnx)",
-        "actions/*.npy or policies/*.pt, *.onnx",
-    ),
-}
+"""Type, pattern and description of a card's values; the pattern of a list is that of its entries."""
 
 
-def _check(record: Any, rules: Rules, where: str) -> None:
-    """Raise UnreadableError for the first mistake in a record that was read from a file."""
-    if not isinstance(record, dict) or record.keys() != rules.keys():
-        odd = list(record.keys() ^ rules.keys()) if isinstance(record, dict) else []
-        which = f": {odd[0]!r:.60} is missing or unknown" if odd else ""
-        raise UnreadableError(f"{where} must have the keys {', '.join(rules)}{which}")
-    for key, (kind, pattern, wanted) in rules.items():
-        value = record[key]
-        parts = value if isinstance(value, list) else [value]
-        texts = [str(part) for part in parts if isinstance(part, str | int | float)]
-        fits = all(text.isprintable() and re.fullmatch(pattern, text) for text in texts)
-        if not (isinstance(value, kind) and fits and 0 < len(texts) == len(parts) <= 50):
-            raise UnreadableError(f"{where}: {key} must be {wanted}, not {value!r:.60}")
+def _require(fits: bool, fault: str) -> None:
+    if not fits:
+        raise UnreadableError(fault)
 
 
 def parse_card(text: bytes, source: str) -> Card:
@@ -294,17 +260,24 @@ def parse_card(text: bytes, source: str) -> Card:
         SubmissionError: If it is not valid YAML or has errors.
     """
     try:
-        if len(text) > _CARD_BYTES:
-            raise UnreadableError(f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
+        _require(len(text) <= _CARD_BYTES, f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
         decoded = text.decode("utf-8")
         # Nested aliases could expand to more than the memory.
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(decoded, yaml.SafeLoader)):
-            raise UnreadableError("it must not have aliases (*)")
+        aliases = [one for one in yaml.parse(decoded, yaml.SafeLoader) if isinstance(one, yaml.AliasEvent)]
+        _require(not aliases, "it must not have aliases (*)")
         record = yaml.safe_load(decoded)
-        if isinstance(record, dict):
-            record = {"description": ""} | record
-        _check(record, _CARD_RULES, "a card")
-    except (UnreadableError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        _require(isinstance(record, dict), f"a card has the keys {', '.join(_CARD_RULES)}")
+        record = {"description": ""} | record
+        if odd := record.keys() ^ _CARD_RULES.keys():
+            raise UnreadableError(f"the key {min(odd, key=str)!r:.60} is missing or unknown")
+        for key, (kind, pattern, wanted) in _CARD_RULES.items():
+            parts = record[key] if kind is list else [record[key]]
+            fits = isinstance(parts, list) and 0 < len(parts) <= 50 and type(record[key]) is kind
+            fits = fits and all(
+                str(part).isprintable() and re.fullmatch(pattern, str(part)) for part in parts
+            )
+            _require(fits, f"{key} must be {wanted}, not {record[key]!r:.60}")
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise SubmissionError(f"{source}: {one_line(error)}") from None
     return Card(**(record | {"authors": tuple(record["authors"])}))
 
@@ -321,7 +294,7 @@ def write(submission: Submission, path: Path) -> None:
     """
     if not path.name.endswith(SUFFIX):
         raise SubmissionError(f"a submission's name ends in {SUFFIX}: {path}")
-    replace_file(path, encode(submission), sync=submission.card is not None, folders=True)
+    replace_file(path, encode(submission), sync=submission.card is not None)
 
 
 def encode(submission: Submission) -> bytes:
@@ -349,46 +322,26 @@ def read(path: str | Path) -> Submission:
     """Read a submission, without executing anything or verifying its claims.
 
     Raises:
-        SubmissionError: If the file is missing, cut off, too large, of another layout or malformed.
+        plab.results.ResultsError: If the file is missing, cut off, too large, of another layout or malformed.
     """
     path = Path(path)
-    try:
-        members = read_members(path)
-        about = json.loads(members.get(_MANIFEST, b"null"))
-        listed = about.pop("entries", None) if isinstance(about, dict) else None
-        if not isinstance(listed, list):
-            raise UnreadableError(f"it is not a submission: it has no {_MANIFEST} with entries")
-        _check(about, _MANIFEST_RULES, _MANIFEST)
-        if about["format"] != FORMAT:
-            layout = f"layout {about['format']}, this plab ({plab.__version__}) reads {FORMAT}"
-            raise UnreadableError(f"it has {layout}")
-        entries = tuple(_entry(f"entry {n}", one, members) for n, one in enumerate(listed))
-    except FileNotFoundError:
-        raise SubmissionError(f"{path} does not exist") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise SubmissionError(f"{path} is damaged or no submission: {one_line(error)}") from None
-    policies = {entry.policy: members[entry.policy] for entry in entries if entry.policy}
+    with explained(path):
+        members = read_members(path, _TOTAL_BYTES)
+        _require(_MANIFEST in members, f"it is not a submission: it has no {_MANIFEST}")
+        about = json.loads(members[_MANIFEST])
+        layout = f"it has layout {about['format']}, this plab ({plab.__version__}) reads {FORMAT}"
+        _require(about["format"] == FORMAT, layout)
+        version, physics = about["plab"], about["physics"]
+        _require(re.fullmatch(r"[\w.+-]{1,40}", version) is not None, f"plab is {version!r:.60}")
+        _require(isinstance(physics, int), f"physics is {physics!r:.60}")
+        entries = tuple(_entry(f"entry {n}", one, members) for n, one in enumerate(about["entries"]))
+        policies = {entry.policy: members[entry.policy] for entry in entries if entry.policy}
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
     card = parse_card(members[_CARD], f"{path}: {_CARD}") if _CARD in members else None
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    submission = Submission(card, entries, policies, about["plab"], about["physics"], path, digest)
+    submission = Submission(card, entries, policies, version, physics, path, digest)
     if fault := inconsistency(submission):
         raise SubmissionError(f"{path}: {fault}")
     return submission
-
-
-def read_members(path: Path) -> dict[str, bytes]:
-    """Read all of a zip file into memory; return the content of each member by name.
-
-    Raises:
-        UnreadableError: If it exceeds the size limit; see also :func:`plab.files.opened_zip`.
-        ValueError: If it is cut off, damaged or encrypted.
-        OSError: If it cannot be opened.
-    """
-    with opened_zip(path) as archive:
-        infos = archive.infolist()
-        if sum(info.file_size for info in infos) > _TOTAL_BYTES:
-            raise UnreadableError(f"it would unpack to more than the {_TOTAL_BYTES / 1e6:.3g} MB allowed")
-        return {info.filename: member_bytes(archive, info.filename) for info in infos}
 
 
 def inconsistency(submission: Submission) -> str | None:
@@ -411,24 +364,25 @@ def inconsistency(submission: Submission) -> str | None:
 
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
-    """Return an entry of the manifest with its actions; raise UnreadableError for mistakes."""
-    _check(record, _ENTRY_RULES, where)
+    """Return an entry of the manifest with its actions; ValueError, KeyError or TypeError for mistakes."""
     configuration = Configuration(*(record[key] for key in ("task", "variant", "targets", "terms")))
-    if configuration.variant in UNSEEN and configuration.targets == "authors":
-        raise UnreadableError(f"{where}: the authors have no targets of {configuration.variant}")
-    file, claim = record["file"], (record["steps"], float(record["score"]))
-    if file not in members:
-        raise UnreadableError(f"{where} names a file that is not there: {file}")
-    digests = Checksums(record["scene"], record["target"])
-    if not file.startswith("actions/"):
-        return Entry(configuration, digests, *claim, policy=file)
+    variants = SUITE_VARIANTS if configuration.targets == "authors" else VARIANTS
+    known = configuration.task in suite_tasks() and configuration.variant in variants
+    known = known and configuration.targets in TARGETS and configuration.terms in TERMS
+    _require(known, f"{where}: the leaderboard has no {configuration}")
+    steps, score, file = record["steps"], record["score"], record["file"]
+    _require(type(steps) is int and 0 <= steps < 10**15, f"{where}: steps is {steps!r:.60}")
+    _require(type(score) in (int, float) and 0.0 <= score <= 1.0, f"{where}: score is {score!r:.60}")
+    kind = re.fullmatch(r"(actions|policies)/[\w.-]+\.(npy|pt|onnx)", file)
+    _require(kind is not None and file in members, f"{where}: there is no file {file!r:.60}")
+    claim = (Checksums(str(record["scene"]), str(record["target"])), steps, float(score))
+    if not file.endswith(".npy"):
+        return Entry(configuration, *claim, policy=file)
     try:
-        actions = np.load(io.BytesIO(members[file]), allow_pickle=False)
-    # NumPy raises arbitrary errors for damaged files.
-    except Exception as error:
-        raise UnreadableError(f"{file} is no NumPy file, or cut off ({one_line(error)})") from None
-    if not isinstance(actions, np.ndarray) or actions.dtype != "<f8" or actions.ndim != 2 or not actions.size:
-        raise UnreadableError(f"{file} must hold float64 numbers of shape [steps, components]")
-    if not (np.abs(actions) <= 1.0).all():
-        raise UnreadableError(f"{file} holds actions outside of [-1, 1]")
-    return Entry(configuration, digests, *claim, actions)
+        actions = array_in(io.BytesIO(members[file]))
+    except UnreadableError as error:
+        raise UnreadableError(f"{file}: {error}") from None
+    fits = actions.dtype == "<f8" and actions.ndim == 2 and actions.size > 0
+    _require(fits, f"{file} must hold float64 numbers of shape [steps, components]")
+    _require(bool((np.abs(actions) <= 1.0).all()), f"{file} holds actions outside of [-1, 1]")
+    return Entry(configuration, *claim, actions)

@@ -20,8 +20,7 @@ import numpy as np
 import plab
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
-from plab.files import one_line
-from plab.results.run_file import replace_file
+from plab.results.run_file import explained, replace_file
 from plab.results.running import now
 from plab.scenes import PRECISIONS
 from plab.submissions.submission import (
@@ -309,7 +308,7 @@ def write_verification(verification: Verification, submission: Path) -> Path:
         "time": now(),
         "entries": entries,
     }
-    replace_file(path, (json.dumps(record, indent=1) + "\n").encode(), sync=False)
+    replace_file(path, json.dumps(record, indent=1) + "\n")
     return path
 
 
@@ -317,13 +316,12 @@ def read_verification(submission: Submission) -> Verification | None:
     """Return the verification of a submission; None if this file was not verified with the current physics.
 
     Raises:
-        SubmissionError: If the verification file cannot be read.
+        plab.results.ResultsError: If the verification file cannot be read.
     """
-    if submission.path is None:
+    if submission.path is None or not (path := verification_path(submission.path)).exists():
         return None
-    path = verification_path(submission.path)
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+    with explained(path):
+        record = json.loads(path.read_bytes())
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
             return None
         verdicts = []
@@ -334,8 +332,3 @@ def read_verification(submission: Submission) -> Verification | None:
                 raise ValueError(f"{entry.name} has an outcome that plab verify does not write")
             verdicts.append(Verdict(entry, scores, own["outcome"], own["why"]))
         return Verification(submission.digest, tuple(verdicts), tuple(record["overrides"]))
-    except FileNotFoundError:
-        return None
-    except Exception as error:
-        why = f"cannot be read ({one_line(error)}): verify the submission again"
-        raise SubmissionError(f"{path} {why}") from None

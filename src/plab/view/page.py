@@ -22,7 +22,6 @@ from plab.render.renderer import (
     MANIPULATOR_COLOR,
     PAPER,
     TARGET_COLOR,
-    part_mesh,
     surface_mesh,
     target_mesh,
 )
@@ -141,7 +140,7 @@ def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[
         for part in manipulator_parts(manipulator):
             poses = recording.poses[steps, number]
             matrices = [pose_matrix(pose, part.side).astype(np.float32) for pose in poses]
-            mesh = _mesh(part_mesh(part), MANIPULATOR_COLOR, "manipulators")
+            mesh = _mesh(part.mesh, MANIPULATOR_COLOR, "manipulators")
             mesh.model_matrix = {str(step): matrix for step, matrix in zip(steps, matrices, strict=True)}
             yield mesh
 
