@@ -13,7 +13,7 @@ import numpy as np
 
 from plab.scenes import Camera
 from plab.sim.compiler import ti
-from plab.sim.tensors import Array, on_device
+from plab.sim.tensors import Array, fill_tensor, on_device
 
 if TYPE_CHECKING:
     import torch
@@ -126,11 +126,10 @@ class CameraSensor:
             picture: Any = like.new_empty(
                 shape, dtype=getattr(sys.modules["torch"], "float32" if real else "int32")
             )
+            fill_tensor(picture, lambda out: write(self._keys, *arguments, out.reshape(-1)))
         else:
             picture = np.empty(shape, kind)
-        write(self._keys, *arguments, picture.reshape(-1))
-        if on_device(like):
-            ti.sync()
+            write(self._keys, *arguments, picture.reshape(-1))
         return picture
 
     # -- kernels --------------------------------------------------------------------------------------

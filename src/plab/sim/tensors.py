@@ -64,10 +64,19 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
     torch = sys.modules["torch"]
     out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
     if count:
-        fill(out)
-        if not _in_default_stream():
-            ti.sync()
+        fill_tensor(out, fill)
     return out.to(like.dtype)
+
+
+def fill_tensor(out: "torch.Tensor", fill: Callable[[Any], None]) -> None:
+    """Fill a new CUDA tensor by the kernel that ``fill`` launches, whatever PyTorch's stream."""
+    if _in_default_stream():
+        fill(out)
+    else:
+        # Pending work of the stream may read memory that the new tensor reuses.
+        sys.modules["torch"].cuda.current_stream().synchronize()
+        fill(out)
+        ti.sync()
 
 
 def numbers_of(
