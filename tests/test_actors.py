@@ -22,6 +22,7 @@ from plab.runners.training import shared_batches
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
+from toy_runner import COARSE_32
 
 HORIZON = 5
 ENVS = 3
@@ -29,10 +30,8 @@ COARSE = (
     "task=Move",
     "observe_particles=5",
     "observe_target=true",
-    "sim.grid_size=32",
-    "sim.particles_scale=0.03",
+    *COARSE_32,
     f"sim.horizon={HORIZON}",
-    "sim.substeps=5",
     f"method.num_envs={ENVS}",
     "method.hidden=[8]",
     "progress=false",

@@ -10,8 +10,9 @@ import pytest
 
 from plab.bench import speed, stability, unseen, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
+from toy_runner import COARSE_32
 
-TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
+TINY = COARSE_32
 
 
 def read(path: Path) -> list[dict[str, str]]:

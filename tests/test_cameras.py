@@ -11,6 +11,7 @@ import plab
 from plab.scenes import Body, Camera, Manipulator, Scene
 from plab.sim import Simulator
 from plab.sim.cameras import FIRST_BODY, FIRST_MANIPULATOR, FLOOR, CameraSensor
+from toy_runner import COARSE_32
 
 DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
 SIZE = 48, 40
@@ -80,13 +81,7 @@ def test_pictures_are_the_same_in_a_batch_and_follow_steps():
         np.testing.assert_array_equal(one.capture("depth")["depth"][0], later["depth"][1])
 
 
-COARSE = [
-    "sim.grid_size=32",
-    "sim.particles_scale=0.03",
-    "sim.horizon=4",
-    "sim.substeps=5",
-    f"sim.device={DEVICE}",
-]
+COARSE = [*COARSE_32, "sim.horizon=4", f"sim.device={DEVICE}"]
 EVERYTHING = {
     "observe": ["state", "particles", "points", "depth", "rgb", "segmentation", "impulses"],
     "cameras": {"top": {"position": (0.5, 2.0, 0.5), "target": (0.5, 0.0, 0.5), "size": (24, 16)}},

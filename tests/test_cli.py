@@ -17,8 +17,7 @@ from plab.config import GROUPS, Config, choices
 from plab.results import ResultsError
 from plab.runners import RunError
 from plab.sim.runtime import cuda_devices
-
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+from toy_runner import COARSE
 
 
 @pytest.fixture(autouse=True)

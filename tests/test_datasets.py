@@ -16,10 +16,10 @@ from plab.results import read
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path
 from same_runs import KeepsAll, finished_as, stopped_at
+from toy_runner import COARSE_32
 
 COARSE = (
-    "observe_particles=5", "observe_target=true", "sim.grid_size=32", "sim.particles_scale=0.03",
-    "sim.dt=2.7e-4", "sim.substeps=7", "progress=false",
+    "observe_particles=5", "observe_target=true", *COARSE_32, "progress=false",
 )  # fmt: skip
 CACHE = KeepsAll()
 

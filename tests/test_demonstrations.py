@@ -19,6 +19,7 @@ from plab.results.table import rows
 from plab.targets import demonstration
 from record_demonstrations import action_names, best_known, save_actions
 from synthetic_runs import synthetic_run
+from toy_runner import COARSE_32
 
 TASKS = (
     "Assembly", "Chopsticks", "Move", "Pinch", "RollingPin", "Rope", "Table", "Torus", "TripleMove", "Writer",
@@ -26,7 +27,7 @@ TASKS = (
 GEOMETRIC = ("Move", "Rope", "TripleMove")
 MOVE_NAMES = ["0_x", "0_y", "0_z", "1_x", "1_y", "1_z"]
 VARIANTS = ("1", "2", "3", "4", "5")
-COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03", "progress=false")
+COARSE = (*COARSE_32, "progress=false")
 
 
 def config(task: str, variant: str, *overrides: str) -> Config:

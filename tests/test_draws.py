@@ -20,10 +20,10 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
 from plab.results import read
 from plab.runners import run_config
+from toy_runner import COARSE_32
 
 DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
-COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=3", "sim.substeps=5"]
-COARSE += [f"sim.device={DEVICE}"]
+COARSE = [*COARSE_32, "sim.horizon=3", f"sim.device={DEVICE}"]
 NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
 RANGES = {
     "yield_stress": [20.0, 200.0],
@@ -132,6 +132,7 @@ def test_what_is_drawn_is_what_is_simulated(vector) -> None:
     batch.close()
 
 
+@pytest.mark.nightly
 def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() -> None:
     cfg = load_config(["task=Rope", *COARSE])
     batch = EpisodeBatch([cfg] * 2, randomize={"scenes": 3})
@@ -179,6 +180,8 @@ def test_methods_train_in_drawn_episodes(method: str, tmp_path: Path) -> None:
     """Another range leads to other training and to an evaluation in the same scene."""
     words = [f"method={method}", "task=Move", *COARSE, f"results_dir={tmp_path}", "progress=false"]
     words += ["method.episodes=4", "method.num_envs=2", "method.evaluate_every=2", "method.hidden=[8]"]
+    if method == "ppo":
+        words += ["method.steps_per_update=12", "method.minibatches=2", "method.epochs=2"]
     if DEVICE == "cuda":
         words.append("method.torch_device=cuda")
     cfgs = [load_config([*words, *key]) for key in ([], HEAVY)]

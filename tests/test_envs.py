@@ -33,9 +33,10 @@ from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, target_observation, target_sdf, total_loss
 from plab.sim import SimulationError
 from suite import make_not_finite
+from toy_runner import COARSE_32
 
 HORIZON = 4
-COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", f"sim.horizon={HORIZON}", "sim.substeps=5"]
+COARSE = [*COARSE_32, f"sim.horizon={HORIZON}"]
 # Targets that the balls reach into, so that IoU and scores are not 0.
 NEAR = [
     "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",

@@ -13,8 +13,9 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
 from plab.runners.networks import CapturedUpdate
 from suite import make_not_finite
+from toy_runner import COARSE_32
 
-COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
+COARSE = [*COARSE_32, "sim.horizon=4"]
 
 pytestmark = [pytest.mark.gpu]
 

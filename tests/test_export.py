@@ -11,12 +11,10 @@ import pytest
 from plab.cli.rollouts import export as main
 from plab.config import load_config
 from plab.render.rollouts import RecordedRollout, record_with_motion
+from toy_runner import COARSE
 
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.files")
-
-
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 
 @pytest.fixture(autouse=True)

@@ -220,6 +220,7 @@ def test_every_extension_task_has_a_known_solution(task: str) -> None:
 COARSE = ("sim.grid_size=16", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.05")
 
 
+@pytest.mark.nightly
 def test_an_arm_is_one_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a task with an articulated model: a run, its demonstration, environments, and what is refused."""
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
@@ -244,6 +245,10 @@ def test_an_arm_is_one_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             seen, *_, info = env.step(action)
             assert env.observation_space.contains(seen)
     assert info["score"] == pytest.approx(best.scores[0].score, abs=1e-6)
+
+
+def test_mistakes_in_a_model_are_named() -> None:
+    words = ["task=Gripper", *COARSE]
     for wrong, named in (
         ("+task.kinematics.scale.finger=0.1", "task.kinematics: scale: 'finger' matches none of turn"),
         ("task.kinematics.start={elbow: 3}", "joint elbow at 3 is outside its limits 0 .. 2.6"),

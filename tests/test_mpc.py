@@ -11,10 +11,11 @@ from plab.config import Config, ConfigError, load_config
 from plab.results import read
 from plab.runners import run_config
 from same_runs import KeepsAll, finished_as, stopped_at
+from toy_runner import COARSE_32
 
 COARSE = (
-    "task=Move", "method=mpc", "sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=5",
-    "sim.substeps=5", "method.window=3", "method.execute=2", "method.planner.iterations=2",
+    "task=Move", "method=mpc", *COARSE_32, "sim.horizon=5",
+    "method.window=3", "method.execute=2", "method.planner.iterations=2",
     "checkpoint_seconds=0", "progress=false",
 )  # fmt: skip
 CEM = ("method.planner.population=4", "method.planner.elites=2")

@@ -9,6 +9,8 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
+
 from plab.config import Config, build_scene, load_config
 from plab.run import main
 
@@ -42,6 +44,7 @@ def test_the_page_shows_the_example_and_its_commands_are_runs_of_it(seen, tmp_pa
     assert [build_scene(cfg).materials[1].youngs_modulus for cfg in seen] == [2000.0, 500.0, 3000.0]
 
 
+@pytest.mark.nightly
 def test_the_cushions_do_as_the_page_prints(monkeypatch):
     monkeypatch.chdir(ROOT)
     with contextlib.redirect_stdout(io.StringIO()) as printed:

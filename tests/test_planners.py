@@ -32,6 +32,7 @@ from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles
 from plab.sweep.running import plan
 from same_runs import assert_same_numbers
+from toy_runner import COARSE_32
 
 # ---------------------------------------------------------------- rules, on a quadratic loss
 
@@ -223,11 +224,8 @@ STEPS = 4
 
 COARSE = (
     "task=Move",
-    "sim.grid_size=32",
+    *COARSE_32,
     f"sim.horizon={STEPS}",
-    "sim.substeps=5",
-    "sim.dt=2e-4",
-    "sim.particles_scale=0.05",
     "progress=false",
 )
 

@@ -16,8 +16,7 @@ from plab.plugins import exported_module_path, load_object, search_in
 from plab.results import check, read
 from plab.runners import Runner, run_batch
 from plab.sweep.running import plan
-
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+from toy_runner import COARSE
 
 
 @pytest.fixture

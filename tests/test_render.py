@@ -29,8 +29,8 @@ from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.sim.cameras import CameraSensor
 from suite import KINDS, SCALES, SIZES
+from toy_runner import COARSE
 
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SIZE = (160, 120)
 CUBE = Body("box", (0.4, 0.1, 0.5), (0.2, 0.2, 0.2), 800)
 BALL = Body("sphere", (0.4, 0.2, 0.5), (0.12,), 800)

@@ -20,8 +20,7 @@ from plab.report.page import best_runs
 from plab.report.statistics import interquartile_mean, shared_strata
 from plab.results import load
 from synthetic_runs import synthetic_run, template
-
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+from toy_runner import COARSE
 
 drawing = pytest.mark.skipif(missing_graphics() is not None, reason=str(missing_graphics()))
 

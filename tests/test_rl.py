@@ -32,6 +32,7 @@ from plab.runners.tracks import Outcome
 from plab.runners.training import evaluate, shared_batches
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
+from toy_runner import COARSE_32
 
 CACHE = KeepsAll()
 
@@ -39,10 +40,8 @@ HORIZON = 4
 
 COARSE = (
     "task=Move",
-    "sim.grid_size=32",
-    "sim.particles_scale=0.03",
+    *COARSE_32,
     f"sim.horizon={HORIZON}",
-    "sim.substeps=5",
     # A target that the ball reaches into, so that IoU and score are not 0.
     "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
     # Room for three replay buffers of METHODS, and for one that holds the whole training.
@@ -405,7 +404,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
         patch.setattr(Population, "train", train)
         ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "failed"]
-    assert ended[1].message.startswith("iteration 1: all 6 episodes")
+    assert ended[1].message.startswith("iteration 1: all 6 ")
     assert ended[2].message.startswith("iteration 2:") and "not finite" in ended[2].message
     assert statuses(cfgs[:1]) == ["before"]
     for cfg, want in zip(cfgs, lone["sac"], strict=True):

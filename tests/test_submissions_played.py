@@ -31,9 +31,10 @@ from plab.submissions.verifying import (
     play,
     read_verification,
 )
+from toy_runner import COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
-COARSE = ("sim.grid_size=32", "sim.horizon=6", "sim.substeps=7", "sim.dt=2.7e-4", "sim.particles_scale=0.03")
+COARSE = (*COARSE_32, "sim.horizon=6")
 CARD = ROOT / "examples" / "outside_agent" / "card.yaml"
 NAME = "RollingPin-v1.plabsub.zip"
 

@@ -22,6 +22,7 @@ from plab.targets import (
     make_recipe,
 )
 from plab.targets.store import TargetStore
+from toy_runner import COARSE_32
 
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}
 BALL = {"shape": "sphere", "center": [0.5, 0.5, 0.5], "size": [0.1]}
@@ -168,12 +169,9 @@ def test_cached_mass_comes_back_and_other_scenes_do_not(rope, store, monkeypatch
     assert blocked.load(rope, actions) is None
 
 
-COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
-
-
 def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, monkeypatch, device):
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
-    overrides = ("task=RollingPin", *COARSE, f"sim.device={device}")
+    overrides = ("task=RollingPin", *COARSE_32, f"sim.device={device}")
     cfgs = [load_config([*overrides, f"variant={k}"]) for k in (2, 3)]
     drawn = load_config([*overrides, "variant=2", "seed_particles=3"])
     softer = [load_config([*overrides, "variant=2", "task.yield_stress=20"])]
@@ -253,6 +251,6 @@ def test_targets_that_cannot_be_built(tmp_path, released, device):
     check_target(*press)
     with pytest.raises(TargetError, match="press"):
         build_target(*press)
-    overrides = ("task=Rope", *COARSE[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
+    overrides = ("task=Rope", *COARSE_32[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
     with pytest.raises(TargetError, match=r"sim\.particles_scale"):
         Problem([load_config(overrides)])

@@ -20,14 +20,14 @@ from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
 from same_runs import KeepsAll, stopped_at
+from toy_runner import COARSE
+from toy_runner import COARSE_32 as SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
-SMALL = ("sim.grid_size=32", "sim.substeps=10", "sim.dt=2e-4", "sim.particles_scale=0.05")
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 CACHE = KeepsAll()
 
 # Run in a copy of plab that has the disc: gradients must be what differences are.
@@ -94,6 +94,7 @@ def test_quick_start_and_readme(page, changes):
     assert names.get("envs") is None or names["envs"].num_envs == 4
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("small")
 def test_paper():
     """Each experiment, with a few steps of training."""

@@ -29,11 +29,11 @@ from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.scenes import sample_particles
 from plab.view import Viewer, show
+from toy_runner import COARSE
 
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
 
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 ACTIONS = np.full((3, 6), 0.5)
 WAY = 0.02 * np.arange(4)[:, None, None] * np.eye(8)[1]
 

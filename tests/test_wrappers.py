@@ -18,9 +18,10 @@ import plab
 from plab.envs.goals import GoalEnv
 from plab.envs.sb3 import PlabVecEnv
 from suite import make_not_finite
+from toy_runner import COARSE_32
 
 HORIZON = 3
-COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", f"sim.horizon={HORIZON}", "sim.substeps=5"]
+COARSE = [*COARSE_32, f"sim.horizon={HORIZON}"]
 COARSE += ["task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"]
 PICTURES = {
     "observe": ["state", "depth"],

@@ -21,6 +21,8 @@ from plab.runners import Runner
 from plab.runners.tracks import RunError, Track
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+COARSE_32 = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
+"""Resolutions of the tests' tasks: a kernel is compiled for the time step, substeps, nodes and particles."""
 
 ITERATIONS = 12
 PAUSE = 0.0
