@@ -44,11 +44,8 @@ def test_an_episode_is_what_its_environment_gives(written: Path) -> None:
     env = plab.make("Move", 1, **{key: kwargs[key] for key in ("observe", "cameras")}, overrides=[
         *kwargs["overrides"], "variant=random"])  # fmt: skip
     first, *others = read_episodes(written / "plab/Move-v0")
-    assert [one.attributes["variant"] for one in (first, *others)] == [
-        "random1000",
-        "random1001",
-        "random1003",
-    ]
+    variants = [one.attributes["variant"] for one in (first, *others)]
+    assert variants == ["random1000", "random1001", "random1003"]
     assert first.attributes["source"] == "adam" and first.observations["top_depth"].shape == (51, 4, 8, 1)
     steps = [(env.reset()[0], 0.0), *(env.step(action)[:2] for action in first.actions)]
     for key in ("state", "top_depth"):
@@ -62,10 +59,8 @@ def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(written))
     dataset = minari.load_dataset("plab/Move-v0")
     for own, theirs in zip(read_episodes(written / "plab/Move-v0"), dataset, strict=True):
-        assert np.array_equal(own.actions, theirs.actions) and theirs.truncations.tolist() == [
-            *[False] * 49,
-            True,
-        ]
+        assert np.array_equal(own.actions, theirs.actions)
+        assert theirs.truncations.tolist() == 49 * [False] + [True]
         last = {key: values[-1] for key, values in theirs.observations.items()}
         assert dataset.observation_space.contains(last)
     assert dataset.recover_environment().observation_space == dataset.observation_space
@@ -107,9 +102,8 @@ def test_parameters_are_found_from_observed_particles(tmp_path: Path) -> None:
     run_config(cfg, CACHE)
     result = read(cfg.path)
     rows, last = result.iterations, result.iterations.iloc[-1]
-    assert last["yield_stress"] == pytest.approx(50.0, rel=0.1) and last["gravity"] == pytest.approx(
-        30.0, rel=0.1
-    )
+    assert last["yield_stress"] == pytest.approx(50.0, rel=0.1)
+    assert last["gravity"] == pytest.approx(30.0, rel=0.1)
     assert rows["misfit"].is_monotonic_decreasing and last["misfit"] < 0.1 * rows["misfit"][0]
     assert 0.0 < last["yield_stress_deviation"] < 5.0 and np.isnan(last["youngs_modulus"])
     with stopped_at(3):

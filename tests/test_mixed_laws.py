@@ -22,10 +22,7 @@ OWN = {
     "viscoplastic": {"yield_stress": 20.0},
     "fluid": {"parameters": {"bulk_modulus": 3000.0}},
 }
-PARAMS = [
-    pytest.param(tuple(LAWS), id="mixed"),
-    pytest.param(("drucker_prager",), id="sand", marks=pytest.mark.nightly),
-]
+SAND = pytest.param(("drucker_prager",), id="sand", marks=pytest.mark.nightly)
 WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)
 """Steps as shares of a value: wide ones cross kinks of yield and contact, narrow ones drown in rounding."""
 
@@ -49,7 +46,7 @@ def layered(laws: tuple[str, ...]) -> Scene:
     return dataclasses.replace(whole, bodies=bodies, manipulators=suite.tools(whole, ("Sphere",)))
 
 
-@pytest.fixture(scope="module", params=PARAMS)
+@pytest.fixture(scope="module", params=[pytest.param(tuple(LAWS), id="mixed"), SAND])
 def simulator(request: pytest.FixtureRequest) -> Simulator:
     scene = layered(request.param)
     terms = make_terms(WEIGHTS)
