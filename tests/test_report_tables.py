@@ -312,7 +312,7 @@ def test_hyperparameters_are_read_from_the_files() -> None:
 
 AGREEMENT = {
     "release": {
-        "all gradient": ("150", "0.97", "93 %"),
+        "all gradient": ("150", "0.97", "97 %"),
         "all RL": ("150", "0.78", "92 %"),
         "PPO": ("50", "0.95", "90 %"),
         "TD3": ("50", "0.64", "94 %"),
@@ -330,7 +330,8 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
     assert main(["tables", name, "--out", str(tmp_path)]) == 0
     # The runs with other yield stresses are for a figure of their own.
     count = len(load(name)) - 5 * (name == "release")
-    tables = 16 if name == "authors" else 17  # no method of the paper: none of agreement
+    # None of agreement without a method of the paper; distances are in newer runs.
+    tables = {"authors": 16, "release": 18}.get(name, 17)
     assert f"{tables} tables of {count} out of" in capsys.readouterr().out
     if name != "authors":
         assert all(problem is None for _, problem in check(example_archive(name)))

@@ -20,8 +20,7 @@ from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
 from same_runs import KeepsAll, stopped_at
-from toy_runner import COARSE
-from toy_runner import COARSE_32 as SMALL
+from toy_runner import COARSE, COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -67,7 +66,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def coarse(overrides: Sequence[str] = (), config_dir: str | None = None) -> Config:
         words = [word for word in overrides if word != "sim.device=cuda"]
         given = {word.partition("=")[0] for word in words}
-        less = (word for word in SMALL if word.partition("=")[0] not in given)
+        less = (word for word in COARSE_32 if word.partition("=")[0] not in given)
         return load_config([*words, *less], config_dir)
 
     def kept(scenes: Sequence[Any], terms: Sequence[Any], **options: Any) -> plab.sim.Simulator:
