@@ -33,8 +33,7 @@ SCENES = [
 ]
 STRAINS = (0.02, 0.6)
 
-PARTS = 3
-"""CUDA's warps for 32 particles; the particles of both environments, padding included, are a multiple."""
+PARTS = 3  # CUDA's warps for 32 particles
 
 ARRAY = ti.types.ndarray(ndim=1)
 
@@ -157,6 +156,7 @@ class Threads(CudaPhases):
 def pair() -> tuple[Tiles, Threads]:
     runtime = start_runtime("cpu", "float64")
     both = Tiles(SCENES, runtime, True), Threads(SCENES, runtime, True)
+    assert both[1].batch * both[1].tiles * both[1].lanes % 32 == 0, "threads would read beyond the particles"
     order = np.stack([np.random.default_rng(9).permutation(s.particle_count) for s in SCENES])
     for phases in both:
         phases.fill_parameters(SCENES)

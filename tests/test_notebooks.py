@@ -98,7 +98,7 @@ class Outputs:
 @pytest.mark.parametrize("name", NUMBERS)
 def test_an_executed_notebook(tmp_path, name):
     shown = Outputs(name, tmp_path)
-    # The loss of own_loss nearly ignores the target.
-    assert shown.views and all(view["scores"][-1] > 0.1 or name == "own_loss" for view in shown.views)
+    least = 0.03 if name == "own_loss" else 0.1  # whose loss nearly ignores the target
+    assert shown.views and all(view["scores"][-1] > least for view in shown.views)
     for pattern, holds in NUMBERS[name].items():
         assert holds(*shown.numbers(pattern)), pattern

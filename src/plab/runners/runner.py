@@ -71,7 +71,11 @@ class Runner:
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
-        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`."""
+        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`.
+
+        Raises:
+            NotImplementedError: Unless a subclass overrides it.
+        """
         raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
@@ -103,8 +107,8 @@ class Runner:
         Raises:
             plab.sim.SimulationError: If a state, loss or gradient diverges.
             plab.runners.RunError: If it fails for another reason.
+            NotImplementedError: Unless a subclass overrides this or :meth:`iterate`.
         """
-        # Not abstract like build, because a family that overrides iterate() has no step.
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
