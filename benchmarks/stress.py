@@ -325,7 +325,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
         rows: Rows of :func:`plab.bench.stability.run_cases`.
         path: CSV file; the drawing is a PNG of the same name.
     """
-    from plab.report.figures import legend, log_axis, single, style
+    from plab.report.figures import legend, single, style
 
     parts = [
         (row["precision"], row["family"], row["case"], cast(np.ndarray, row["norms"])[::-1]) for row in rows
@@ -343,7 +343,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
             panel.plot(norms, "-" if precision == "float32" else ":", color=colour, label=label)
         panel.set_xlabel("environment steps back from the end")
         panel.set_title("solid: float32, dotted: float64", loc="right")
-        log_axis(panel, "norm of a step's gradient", vertical=True)
+        panel.set(yscale="log", ylabel="norm of a step's gradient")
         if len(colours) <= LABELLED:
             legend(figure, columns=3)
         figure.savefig(path.with_suffix(".png"))

@@ -25,7 +25,7 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 import numpy as np
 import pandas as pd
 
-from plab.report.figures import Drawing, legend, precision_summary, single, style, work_precision
+from plab.report.figures import Drawing, diagrams, legend, precision_summary, single, style
 from plab.report.methods import method
 from plab.report.notebook_cells import benchmark, gather, show_figure, show_origin, show_table
 from plab.report.reference import ACCURACY, PRECISION, origin
@@ -42,8 +42,9 @@ show_origin(runs, COMMAND)
 table = benchmark(BENCH, ACCURACY)
 if table is not None:
     with style():
-        drawing = work_precision(table)
-    show_figure(drawing)
+        drawings = diagrams(table)
+    for drawing in drawings:
+        show_figure(drawing)
 
 # %% [markdown]
 # ## float32 against float64

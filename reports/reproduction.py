@@ -48,7 +48,7 @@ show_origin(runs, COMMAND)
 # runs of incomplete cells.
 
 # %%
-ours, paper, compared = iou_per_task(runs)
+ours, compared = iou_per_task(runs)
 show_table(ours)
 
 # %% [markdown]
@@ -125,11 +125,10 @@ else:
 # limit, not the task.
 
 # %%
-show_table(solvability(runs)[2])
+show_table(*solvability(runs))
 
 # %% [markdown]
 # ## The paper's numbers
 
 # %%
-show_table(paper)
 show_table(compared)

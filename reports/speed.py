@@ -24,7 +24,7 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 # %%
 import numpy as np
 
-from plab.report.figures import PHASES, Drawing, grid, legend, log_axis, single, style
+from plab.report.figures import PHASES, Drawing, grid, legend, single, style
 from plab.report.methods import method
 from plab.report.notebook_cells import benchmark, gather, say, show_figure, show_origin, show_table
 from plab.report.reference import SPEED
@@ -38,7 +38,7 @@ speed = benchmark(BENCH, SPEED)
 # ## Time per environment step
 
 # %%
-ours, paper, compared = timing(runs, speed)
+ours, compared = timing(runs, speed)
 show_table(compared)
 
 
@@ -63,7 +63,7 @@ def draw_step_times(compared):
                        label="the paper, GTX 1080 Ti", zorder=2)  # fmt: skip
             panel.plot(row["ms"], y, markers[row["measured"]], color="#0072B2", markersize=5,
                        label=f"plab: {row['measured']}", zorder=3)  # fmt: skip
-        log_axis(panel, f"{kind} [ms per environment step]")
+        panel.set(xscale="log", xlabel=f"{kind} [ms per environment step]")
         panel.set_yticks(range(len(tasks)), tasks)
         panel.set_ylim(len(tasks) - 0.5, -0.5)
     legend(figure, columns=1)

@@ -311,7 +311,7 @@ def main(argv: Sequence[str]) -> None:
     table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
     with style():
         drawings = diagrams(pd.DataFrame(table))
-    save(drawings, output, {"footer": ["plab bench accuracy"]})
+    save(drawings, output, "plab bench accuracy")
     for drawing in drawings:
         print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
 

@@ -19,7 +19,6 @@ from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_t
 from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
-from plab.results.running import held
 from plab.results.table import sources_of
 
 NAMES = ("task", "variant", "method", "seed")
@@ -46,24 +45,6 @@ class MixedRunsError(PlabError, ValueError):
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A setting that differs from plab's default.
-
-    Attributes:
-        key: Dotted key of the setting.
-        value: Value of the setting.
-        whose: Methods with this setting, with tasks and variants as far as needed; empty for all methods.
-    """
-
-    key: str
-    value: Any
-    whose: str
-
-    def __str__(self) -> str:
-        return f"{self.key} = {self.value}" + (f" ({self.whose})" if self.whose else "")
-
-
-@dataclass(frozen=True)
 class Runs:
     """Finished runs, and the requested ones.
 
@@ -74,11 +55,10 @@ class Runs:
         methods: Requested methods, in the order of tables.
         seeds: Requested seeds.
         unfinished: Number of requested runs that are not finished and not in ``table``.
-        under_way: Number of these runs in progress.
         others: Number of finished runs that were not requested.
         set_aside: Number of finished runs left out because others of the same task and method have fewer
             changes to plab's settings.
-        unusual: Settings that differ from plab's.
+        unusual: Settings that differ from plab's, as text, with methods if only some runs have them.
         protocol: Name of their protocol.
         unreadable: Messages about files that could not be read.
         configs: Configurations of the runs, in the order of ``table``.
@@ -90,10 +70,9 @@ class Runs:
     methods: list[str]
     seeds: list[str]
     unfinished: int
-    under_way: int
     others: int
     set_aside: int
-    unusual: list[Setting]
+    unusual: list[str]
     protocol: str
     unreadable: list[str]
     configs: list[dict[str, Any]]
@@ -132,23 +111,6 @@ class Runs:
         ]
 
 
-@dataclass(frozen=True)
-class Ablation:
-    """Runs that differ in one setting.
-
-    Attributes:
-        task: Name of the task.
-        variant: Name of the variant.
-        method: Name of the method.
-        paths: Files of the runs, by the setting's value.
-    """
-
-    task: str
-    variant: str
-    method: str
-    paths: dict[Any, list[Path]]
-
-
 def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split: str = "") -> Runs:
     """Find the runs for tables and curves.
 
@@ -174,8 +136,9 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     complete = [row for row in inside if row.values["status"] == "finished"]
     methods, seeds = asked["method"], asked["seed"]
     if split:
-        complete, names = _split(complete, split, sources_of(source))
-        methods = [name for whole in methods for name in names.get(whole, [whole])]
+        complete, new = _split(complete, split, sources_of(source))
+        names = {whole: [name for (of, _), name in new.items() if of == whole] for whole in methods}
+        methods = [name for whole in methods for name in names[whole] or [whole]]
         # Each seed is treated as a method with one run.
         seeds = seeds[:1] if split == "seed" else seeds
     protocol = one_protocol(row.config for row in complete)
@@ -190,7 +153,6 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         methods=methods,
         seeds=seeds,
         unfinished=len(inside) - len(complete),
-        under_way=sum(held(row.path) for row in inside if row.values["status"] != "finished"),
         others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
         set_aside=len(complete) - len(finished),
         unusual=unusual,
@@ -211,85 +173,37 @@ def _asked(found: Sequence[Row], chosen: Selection) -> dict[str, list[str]]:
     return {name: chosen.choices.get(name, free[name]) for name in NAMES}
 
 
-def collect_ablation(
-    source: str | Path | Sequence[str | Path], chosen: Selection, key: str
-) -> Ablation | None:
-    """Find the finished runs of one task, variant and method that differ in one setting.
-
-    Args:
-        source: Folder of results, archive, or several of them.
-        chosen: Choice of runs.
-        key: Dotted key of the setting.
-
-    Returns:
-        The task, variant and method with the most values; None if the setting never varies.
-
-    Raises:
-        MixedRunsError: If they differ in other settings, or have the same seed.
-    """
-    groups: dict[tuple[str, ...], dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows(source)[0]:
-        value = lookup(row.config, key)
-        finished = row.values["status"] == "finished"
-        if finished and chosen(row.values, row.config) and isinstance(value, str | int | float):
-            groups[tuple(str(row.values[name]) for name in NAMES[:3])][value].append(row)
-    (task, variant, method), by_value = max(
-        groups.items(), key=lambda item: len(item[1]), default=(("", "", ""), {})
-    )
-    if len(by_value) < 2:
-        return None
-    what = f"{task}-v{variant} {method}"
-    for value, same in by_value.items():
-        _refuse_differing(f"{what}, {key} = {value}", [row.config for row in same])
-        _refuse_repeated(same)
-    _refuse_differing(what, [row.config for same in by_value.values() for row in same], apart=key)
-    paths = {value: [row.path for row in same] for value, same in by_value.items()}
-    return Ablation(task, variant, method, paths)
-
-
-def _split(found: Sequence[Row], key: str, places: Sequence[Path]) -> tuple[list[Row], dict[str, list[str]]]:
-    """Return runs with methods renamed if they have several values of a setting, and the new names by
-    method."""
-    texts = [_split_value(row, key, places) for row in found]
-    methods = [row.values["method"] for row in found]
-    new: dict[tuple[str, str], str] = {}
-    for name in dict.fromkeys(methods):
-        own = {text for of, text in zip(methods, texts, strict=True) if of == name}
-        for text in sorted(own, key=_by_number) if len(own) > 1 else ():
-            new[name, text] = part(name, key.rpartition(".")[2], text, len(new))
+def _split(
+    found: Sequence[Row], key: str, places: Sequence[Path]
+) -> tuple[list[Row], dict[tuple[str, Any], str]]:
+    """Return runs with methods renamed if they have several values of a setting, and the new names by method
+    and value."""
+    pairs = [(row.values["method"], _split_value(row, key, places)) for row in found]
+    new: dict[tuple[str, Any], str] = {}
+    for name, value in sorted(set(pairs), key=lambda pair: (pair[0], isinstance(pair[1], str), pair[1])):
+        if len({own for other, own in pairs if other == name}) > 1:
+            new[name, value] = part(name, key.rpartition(".")[2], str(value), len(new))
     if not new:
         raise ArgumentError(
             f"no method has runs that differ in {key}: split by a key in which they do, such as method.lr, "
             "or by folder or seed"
         )
     renamed = [
-        replace(row, values=row.values | {"method": new.get((name, text), name)})
-        for row, name, text in zip(found, methods, texts, strict=True)
+        replace(row, values=row.values | {"method": new.get(pair, pair[0])})
+        for row, pair in zip(found, pairs, strict=True)
     ]
-    names: dict[str, list[str]] = defaultdict(list)
-    for (name, _), own_name in new.items():
-        names[name].append(own_name)
-    return renamed, names
+    return renamed, new
 
 
-def _split_value(row: Row, key: str, places: Sequence[Path]) -> str:
+def _split_value(row: Row, key: str, places: Sequence[Path]) -> Any:
     if key == "seed":
-        return str(row.values["seed"])
+        return row.values["seed"]
     if key == "folder":
         return next(str(place) for place in places if row.path.is_relative_to(place))
     if "." not in key:
         raise ArgumentError(f"cannot split by '{key}': give a dotted key such as method.lr, folder or seed")
     value = lookup(row.config, key)
-    if value is None or value != value:
-        return "none"
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _by_number(text: str) -> tuple[float, str]:
-    try:
-        return float(text), text
-    except ValueError:
-        return float("inf"), text
+    return value if isinstance(value, str | int | float) and value == value else json.dumps(value)
 
 
 # --------------------------------------------------------------------------------------------------- settings
@@ -297,35 +211,23 @@ def _by_number(text: str) -> tuple[float, str]:
 
 def _refuse_mixed(found: Sequence[Row]) -> None:
     """Reject runs of one configuration, or of one task and method, with different settings."""
-    groups: dict[tuple[str, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = defaultdict(list)
+    by_name: dict[tuple[str, ...], Row] = {}
     for row in found:
-        groups[row.values["task"], row.values["method"]][row.values["variant"]].append(row)
-    for (task, name), variants in groups.items():
-        every = [row.config for own in variants.values() for row in own]
-        sections = [{key: config[key] for key in ("protocol", "sim", "method")} for config in every]
-        _refuse_differing(f"{task} {name}", sections)
-        for variant, same in variants.items():
-            _refuse_differing(f"{task}-v{variant} {name}", [row.config for row in same])
-            _refuse_repeated(same)
-
-
-def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
-    for key, values in _differences(configs).items():
-        if key not in _IGNORED_KEYS and key != apart:
-            texts = " and ".join(map(str, values))
-            advice = f"choose one, for example {key}={values[0]}"
-            raise MixedRunsError(f"runs of {what} differ in {key}, which is {texts}: {advice}")
-
-
-def _refuse_repeated(found: Sequence[Row]) -> None:
-    by_seed: dict[str, Row] = {}
-    for row in found:
-        other = by_seed.setdefault(str(row.values["seed"]), row)
-        if other is row:
-            continue
-        keys = [key for key in _differences([other.config, row.config]) if key != "results_dir"]
-        how = f"choose one by {keys[0]}=" if keys else "remove one"
-        raise MixedRunsError(f"{other.path} and {row.path} have the same seed: {how}")
+        task, variant, name, seed = (str(row.values[name]) for name in NAMES)
+        groups[task, name].append({key: row.config[key] for key in ("protocol", "sim", "method")})
+        groups[f"{task}-v{variant}", name].append(row.config)
+        other = by_name.setdefault((task, variant, name, seed), row)
+        if other is not row:
+            keys = [key for key in _differences([other.config, row.config]) if key != "results_dir"]
+            how = f"choose one by {keys[0]}=" if keys else "remove one"
+            raise MixedRunsError(f"{other.path} and {row.path} have the same seed: {how}")
+    for names, configs in groups.items():
+        for key, values in _differences(configs).items():
+            if key not in _IGNORED_KEYS:
+                texts = " and ".join(map(str, values))
+                advice = f"choose one, for example {key}={values[0]}"
+                raise MixedRunsError(f"runs of {' '.join(names)} differ in {key}, which is {texts}: {advice}")
 
 
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -346,48 +248,26 @@ def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     return {key: list(values.values()) for key, values in seen.items() if len(values) > 1}
 
 
-def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Setting]]:
-    """Select, for each task and method, the runs with the fewest changes to plab's settings.
-
-    Args:
-        found: The runs.
-        apart: Key that is not counted as a change.
-
-    Returns:
-        These runs, and their settings that differ from plab's.
-    """
-    changes = [
-        {key: value for key, value in changed_settings(row.config).items() if key != apart} for row in found
-    ]
-    pairs = [(row.values["task"], row.values["method"]) for row in found]
+def _prefer_usual(found: Sequence[Row], split: str) -> tuple[list[Row], list[str]]:
+    """Select, for each task and method, the runs with the fewest changes to plab's settings, not counting the
+    key ``split``; return them, and their settings that differ from plab's."""
+    changes = [changed_settings(row.config) for row in found]
     fewest: dict[tuple[str, str], int] = {}
-    for pair, changed in zip(pairs, changes, strict=True):
+    for row, changed in zip(found, changes, strict=True):
+        changed.pop(split, None)
+        pair = row.values["task"], row.values["method"]
         fewest[pair] = min(len(changed), fewest.get(pair, len(changed)))
     kept = []
-    whose: dict[tuple[str, str], list[Row]] = defaultdict(list)
-    for row, pair, changed in zip(found, pairs, changes, strict=True):
-        if len(changed) == fewest[pair]:
+    whose: dict[str, list[str]] = defaultdict(list)
+    for row, changed in zip(found, changes, strict=True):
+        if len(changed) == fewest[row.values["task"], row.values["method"]]:
             kept.append(row)
             for key, value in changed.items():
-                whose[key, json.dumps(value)].append(row)
+                whose[f"{key} = {value}"].append(method(row.values["method"]).label)
     return kept, [
-        Setting(key, json.loads(text), _described(own, kept)) for (key, text), own in sorted(whose.items())
+        text if len(labels) == len(kept) else f"{text} (runs of {', '.join(sorted(set(labels)))})"
+        for text, labels in sorted(whose.items())
     ]
-
-
-def _described(own: Sequence[Row], every: Sequence[Row]) -> str:
-    """Return the shortest description that distinguishes some runs from all others; empty if there are no
-    others."""
-    for names in ((), ("method",), ("method", "task"), ("method", "task", "variant")):
-        kinds = {tuple(row.values[name] for name in names) for row in own}
-        if sum(tuple(row.values[name] for name in names) in kinds for row in every) == len(own):
-            break
-    texts = [
-        f"{method(kind[0]).label}{' on ' if kind[1:] else ''}{'-v'.join(kind[1:])}"
-        for kind in sorted(kinds)
-        if kind
-    ]
-    return ", ".join(texts[:3]) + (f" and {len(texts) - 3} more" if len(texts) > 3 else "")
 
 
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:

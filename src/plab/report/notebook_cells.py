@@ -12,7 +12,7 @@ from IPython.display import HTML, Image, Markdown, display
 
 from plab.config.selection import select
 from plab.report.collect import NAMES, Runs, collect
-from plab.report.figures import Drawing, fix_layout, style
+from plab.report.figures import Drawing, style
 from plab.report.reference import Benchmark, measured
 from plab.report.tables import Table, aligned
 from plab.results import ResultsError
@@ -39,14 +39,13 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
 
 def show_origin(runs: Runs, command: str) -> None:
     """Show the command and the result files behind the following output."""
-    lines = [
-        f"Made by <code>{escape(command)}</code> from {len(runs.table)} run(s); SHA-256 over them "
-        f"<code>{runs.digest}</code>."
-    ]
-    lines += [escape(line) + "." for line in runs.left_out()]
-    names = runs.table.reindex(columns=["task", "variant", "method", "seed", "config_hash", "path"])
+    say(
+        f"Made by `{command}` from {len(runs.table)} run(s); SHA-256 over them `{runs.digest}`. "
+        + " ".join(f"{line}." for line in runs.left_out())
+    )
+    names = runs.table.reindex(columns=[*NAMES, "config_hash", "path"])
     files = names.to_html(index=False, border=0, classes="plain")
-    display(HTML(f"<p>{' '.join(lines)}</p><details><summary>The result files</summary>{files}</details>"))
+    display(HTML(f"<details><summary>The result files</summary>{files}</details>"))
 
 
 def say(text: str) -> None:
@@ -57,20 +56,15 @@ def say(text: str) -> None:
 def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
     """Show a table of the report, or cells of text."""
     whole = table if isinstance(table, Table) else Table("", "", "", table, table, notes=list(notes))
-    sides = ["number" if side == "r" else "" for side in aligned(whole.cells)]
-    names = zip(whole.cells.columns, sides, strict=True)
-    head = "".join(f'<th class="{side}">{escape(str(name))}</th>' for name, side in names)
-    body = ""
-    for r, line in enumerate(whole.cells.to_numpy(dtype=str)):
-        bold = [whole.bold is not None and whole.bold[r, c] for c in range(len(line))]
-        body += f"<tr>{''.join(map(_cell, line, bold, sides))}</tr>"
-    html = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    display(HTML(html + f'<p class="note">{escape(" ".join(whole.notes))}</p>'))
-
-
-def _cell(text: str, bold: bool, side: str) -> str:
-    shown = f"<b>{escape(text)}</b>" if bold else escape(text)
-    return f'<td class="{side}">{shown}</td>' if side else f"<td>{shown}</td>"
+    cells = whole.cells
+    shown = cells.style.hide(axis="index").format(escape="html")
+    if whole.bold is not None:
+        weights = np.where(whole.bold, "font-weight: bold", "")
+        shown = shown.apply(lambda _: weights, axis=None)
+    numbers = [name for name, side in zip(cells.columns, aligned(cells), strict=True) if side == "r"]
+    shown = shown.set_properties(subset=numbers, **{"text-align": "right"})
+    display(HTML(f'<div class="scroll">{shown.to_html()}</div>'))
+    display(HTML(f'<p class="note">{escape(" ".join(whole.notes))}</p>'))
 
 
 def show_figure(drawing: Drawing | None) -> None:
@@ -80,9 +74,8 @@ def show_figure(drawing: Drawing | None) -> None:
         return
     content = io.BytesIO()
     with style():
-        fix_layout(drawing.figure)
         drawing.figure.savefig(content, format="png", dpi=_DPI)
-    width = int(np.ceil(drawing.figure.get_figwidth() * 110))
+    width = int(drawing.figure.get_figwidth() * 110)
     display(Image(content.getvalue(), width=width, alt=drawing.name))
     display(HTML(f'<p class="note">{escape(" ".join(drawing.notes))}</p>'))
 

@@ -32,13 +32,6 @@ def notebook_folder() -> Path:
     raise ResultsError(f"no reports/ next to {package}: the installation is incomplete, install plab again")
 
 
-def require_notebooks() -> None:
-    """Raise :class:`plab.results.ResultsError` if a package that executes notebooks is missing."""
-    if missing := [name for name in _PACKAGES if find_spec(name) is None]:
-        what = f"{', '.join(missing)}, not installed here: pip install 'plab[report]'"
-        raise ResultsError(f"notebooks need {what}")
-
-
 def execute(
     names: Sequence[str], parameters: Mapping[str, Any], out: Path, report: Callable[[int, str], None]
 ) -> list[Path]:
@@ -54,9 +47,11 @@ def execute(
         The pages.
 
     Raises:
-        plab.results.ResultsError: If a notebook fails.
+        plab.results.ResultsError: If a package is missing, or a notebook fails.
     """
-    require_notebooks()
+    if missing := [name for name in _PACKAGES if find_spec(name) is None]:
+        what = f"{', '.join(missing)}, not installed here: pip install 'plab[report]'"
+        raise ResultsError(f"notebooks need {what}")
     import nbformat
 
     pages = []

@@ -2,7 +2,7 @@
 
 The page needs no server and no network. ``index.html`` contains style, script and the overview. The curves of
 a configuration are in a script below ``data/``, loaded on demand, because pages opened as files can load
-scripts but not data. ``data/state.js`` has the current version, so that an open page detects updates.
+scripts but not data.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import shlex
 import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from plab.report.statistics import (
     shared_strata,
 )
 from plab.report.tables import Cell, compare, ordered_tasks, settings_note
+from plab.report.writing import origin
 from plab.results.run_file import replace_file
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
@@ -53,9 +54,6 @@ _DIGITS = 4
 _THRESHOLDS = 51
 """Thresholds of a performance profile."""
 
-_RELOAD_INTERVAL = 3000
-"""Interval at which a live page checks whether it has been written again [ms]."""
-
 _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "configuration.js", "page.js")
 
 
@@ -66,17 +64,15 @@ class Page:
         shown: Configurations and their runs in pictures.
     """
 
-    def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_run: bool = False) -> None:
+    def __init__(self, runs: Runs, out: Path, command: str) -> None:
         """Write curves and runs of each configuration to ``data/``, and compute the overview.
 
         Args:
             runs: Our runs.
             out: Folder to write to.
-            origin: Origin of the page: ``command``, ``digest``, ``plab``.
-            every_run: As for :func:`best_runs`.
+            command: Command that makes the page.
         """
-        self.shown = best_runs(runs, every_run=every_run)
-        self._out, self._under_way = out, runs.under_way > 0
+        self.shown, self._out = best_runs(runs), out
         cells = compare(runs, "task") | compare(runs, "configuration")
         tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
         self._content = {
@@ -84,11 +80,16 @@ class Page:
             "tasks": [
                 {"task": task, "cells": _by_method(cells, runs, task)} for task in tasks if task in with_runs
             ],
-            "gallery": _gallery(self.shown),
+            "gallery": [
+                {"task": one.task, "name": one.name, "method": one.best}
+                | {"seed": one.run["seed"], "score": _finite(one.run["score"])}
+                for task in tasks
+                for one in self.shown
+                if one.film and one.task == task
+            ],
             "aggregates": _aggregates(runs),
             "axes": list(AXES),
             "columns": list(_COLUMNS),
-            "every": _RELOAD_INTERVAL,
         }
         best = {one.name: one.best for one in self.shown}
         self._configurations: list[dict[str, Any]] = [
@@ -98,52 +99,48 @@ class Page:
             for task in tasks
             for variant in runs.variants
         ]
-        known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
         self._values: dict[str, Any] = {
             "style": asset("page.css"),
             "script": "".join(map(asset, _SCRIPTS)),
             "methods": [method(name) for name in runs.methods],
-            "origin": origin,
-            "runs": sorted(known, key=lambda row: [str(value) for value in row.values()]),
+            "origin": origin(runs, command),
             "expected": runs.expected,
-            "sentence": _sentence(runs),
-            "incomplete": _incomplete(runs),
-            "notes": settings_note(runs),
-            "left_out": runs.left_out(),
+            "notes": [*settings_note(runs), *runs.left_out()],
             "tasks": len(with_runs),
             "all_tasks": len(tasks),
         }
-        self._write_details(runs)
-
-    def _write_details(self, runs: Runs) -> None:
-        folder = self._out / "data"
-        # Left by a killed process.
-        for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
-            path.unlink()
         series = load_series(runs)
         for one in self.shown:
             text = json.dumps(_details(one, runs, series), separators=(",", ":"), allow_nan=False)
-            replace_file(folder / f"{one.name}.js", f"plab.receive({json.dumps(one.name)},{text});\n")
-        for path in folder.glob("*-v*.js"):
-            if path.stem not in {one.name for one in self.shown}:
-                path.unlink()
+            file = out / "data" / f"{one.name}.js"
+            replace_file(file, f"plab.receive({json.dumps(one.name)},{text});\n")
 
-    def write(self, *, drawing: bool = False) -> None:
-        """Write ``index.html`` with the existing pictures.
-
-        Args:
-            drawing: Whether pictures are being rendered. Then, or while runs are in progress, the page
-                reloads itself after updates.
-        """
-        pictures = {one.name: present(one, self._out) for one in self.shown}
+    def write(self) -> None:
+        """Write ``index.html`` with the existing pictures."""
+        pictures = {one.name: one.pictures(self._out) for one in self.shown}
         configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
-        content = self._content | {"configurations": configurations, "live": drawing or self._under_way}
-        state = hashlib.sha256(json.dumps([content, str(self._values)]).encode()).hexdigest()[:16]
-        text = json.dumps(content | {"state": state}, separators=(",", ":"), allow_nan=False)
+        content = self._content | {"configurations": configurations}
+        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
         # The only character that could end the enclosing script.
         html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
         replace_file(self._out / "index.html", html)
-        replace_file(self._out / "data" / "state.js", f"plab.state({json.dumps(state)});\n")
+
+    def missing_pictures(self) -> dict[Path, dict[str, tuple[Path, bool]]]:
+        """Return the folders of missing pictures, with result file and whether there is a film by stem."""
+        folders = {self._out / one.folder: one for one in self.shown}
+        return {
+            folder: {"end": (Path(one.run["path"]), one.film)}
+            for folder, one in folders.items()
+            if not folder.is_dir()
+        }
+
+    def remove_surpassed(self) -> None:
+        """Remove pictures of surpassed runs of configurations that have those of the best run."""
+        for one in self.shown:
+            current = self._out / one.folder
+            for folder in current.parent.glob(f"{one.name}-{'[0-9a-f]' * 8}") if current.is_dir() else ():
+                if folder != current:
+                    shutil.rmtree(folder)
 
 
 def _look(look: Method, place: int) -> dict[str, str]:
@@ -180,59 +177,21 @@ def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -
     }
 
 
-def _listed(texts: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
-
-
-def _plural(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-def _sentence(runs: Runs) -> str:
-    """Return a note on the runs of the page."""
-    table = runs.table
-    configurations = len(table[["task", "variant"]].drop_duplicates())
-    tasks = sorted(set(table["task"]))
-    where = f"of {_plural(len(tasks), 'task')}" if len(tasks) > 1 else f"of {tasks[0]}"
-    return (
-        f"{_plural(len(table), 'run')} by {_listed([method(name).label for name in runs.present])} on "
-        f"{_plural(configurations, 'configuration')} {where}, scored from 0, where a task starts, to 1, "
-        "its target."
-    )
-
-
-def _incomplete(runs: Runs) -> list[str]:
-    """Return a note on methods with missing runs, with their numbers of runs; empty if complete."""
-    expected = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
-    counts = {method(name).label: int((runs.table["method"] == name).sum()) for name in runs.present}
-    short = [f"{label} with {count}" for label, count in counts.items() if count < expected]
-    return [f"Incomplete are {_listed(short)} of {_plural(expected, 'run')} each."] if short else []
-
-
-def _gallery(shown: Sequence[Shown]) -> list[dict[str, Any]]:
-    """Return the best run of each task."""
-    best = _best_of_tasks(shown)
-    listed = []
-    for task in ordered_tasks(list(best)):
-        name, run = best[task].best, best[task].run
-        listed.append({"task": task, "name": best[task].name, "method": name, "seed": run["seed"]})
-        listed[-1]["score"] = _finite(run["score"])
-    return listed
-
-
 def _aggregates(runs: Runs) -> Mapping[str, Any]:
     """Return interquartile means, performance profiles and probabilities of improvement, each with its
     interval, and a note on the runs included."""
     shared = shared_strata(runs)
     strata = shared.strata
     thresholds = np.linspace(0.0, 1.0, _THRESHOLDS)
-    profiles = {name: performance_profile(own, thresholds) for name, own in strata.items()}
     return {
         "notes": shared.notes,
         "mean": {name: _ends(interquartile_mean(own)) for name, own in strata.items()},
         "profile": {
             "x": thresholds.round(4).tolist(),
-            "methods": {name: [one.round(4).tolist() for one in own] for name, own in profiles.items()},
+            "methods": {
+                name: np.round(performance_profile(own, thresholds), 4).tolist()
+                for name, own in strata.items()
+            },
         },
         "better": {
             one: {other: _ends(improvement(strata[one], strata[other])) for other in strata if other != one}
@@ -285,15 +244,10 @@ def _command(config: Mapping[str, Any]) -> str:
         words.append(f"protocol={config['protocol']['name']}")
     if config["sim"]["device"] != "cpu":
         words.append(f"sim.device={config['sim']['device']}")
-    words += [f"{key}={_override_text(value)}" for key, value in changed_settings(config).items()]
+    for key, value in changed_settings(config).items():
+        text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        words.append(f"{key}={text.replace('Infinity', '.inf')}")
     return shlex.join(["plab", "run", *words])
-
-
-def _override_text(value: Any) -> str:
-    """Format a value as in an override."""
-    if isinstance(value, str):
-        return value
-    return json.dumps(value, separators=(",", ":")).replace("Infinity", ".inf")
 
 
 def _curve(
@@ -309,9 +263,6 @@ def _curve(
 
 # --------------------------------------------------------------------------------------- pictures and films
 
-FOLDER = "media"
-"""Folder of pictures, below that of the page."""
-
 
 @dataclass(frozen=True)
 class Shown:
@@ -321,15 +272,13 @@ class Shown:
         task: Name of the task.
         variant: Name of the variant.
         runs: Best run of each method: its row of the table of runs.
-        drawn: Methods with a picture.
-        films: Methods with a film.
+        film: Whether there is a film of the best run, which is the best one of its task.
     """
 
     task: str
     variant: str
     runs: Mapping[str, Mapping[str, Any]]
-    drawn: frozenset[str] = frozenset()
-    films: frozenset[str] = frozenset()
+    film: bool = False
 
     @property
     def name(self) -> str:
@@ -347,100 +296,37 @@ class Shown:
         return self.runs[self.best]
 
     @property
-    def folder(self) -> str:
-        """Name of the folder of its pictures, derived from the runs and films."""
+    def folder(self) -> Path:
+        """Folder of its pictures below that of the page."""
         # Repeated runs have the same configuration, but different actions.
-        drawn = [self.runs[name] for name in sorted(self.drawn)]
-        own = [[run["config_hash"], run["best_loss"]] for run in drawn]
-        text = json.dumps([own, sorted(self.films)])
-        return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+        text = json.dumps([self.run["config_hash"], self.run["best_loss"], self.film])
+        return Path("media") / f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
-    def stem(self, method: str) -> str:
-        """Return the stem of the file names of a method's picture and film."""
-        return str(self.runs[method]["config_hash"])[:12]
+    def pictures(self, out: Path) -> dict[str, str]:
+        """Return the existing pictures by subject, relative to the folder ``out`` of the page: ``start``,
+        ``target``, ``<method>``, ``<method> film``."""
+        names = {"start": "start.webp", "target": "target.webp"}
+        names |= {self.best: "end.webp", f"{self.best} film": "end.mp4"}
+        return {
+            what: (self.folder / name).as_posix()
+            for what, name in names.items()
+            if (out / self.folder / name).is_file()
+        }
 
 
-def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
-    """Return the run with the highest score of each configuration and method.
-
-    Args:
-        runs: Our runs.
-        every_run: Whether all runs have a picture and a film; otherwise only the best of each configuration
-            has a picture, and the best of each task a film.
-    """
+def best_runs(runs: Runs) -> list[Shown]:
+    """Return the run with the highest score of each configuration and method."""
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
     # Ties are broken by the hash, independent of the order of files.
     table = runs.table.sort_values(["score", "config_hash"], ascending=[False, True])
     for row in table.to_dict("records"):
         found[row["task"], row["variant"]].setdefault(row["method"], row)
-    shown = [
-        Shown(task, variant, {name: own[name] for name in runs.methods if name in own})
+    # The first configuration of a task has its best run.
+    best = dict(reversed(found))
+    return [
+        Shown(task, variant, {name: own[name] for name in runs.methods if name in own}, best[task] == variant)
         for (task, variant), own in sorted(found.items())
     ]
-    if every_run:
-        return [replace(one, drawn=frozenset(one.runs), films=frozenset(one.runs)) for one in shown]
-    filmed = {one.name for one in _best_of_tasks(shown).values()}
-    return [
-        replace(one, drawn=frozenset([one.best]), films=frozenset([one.best] if one.name in filmed else []))
-        for one in shown
-    ]
-
-
-def _best_of_tasks(shown: Sequence[Shown]) -> dict[str, Shown]:
-    """Return the configuration of the run with the highest score of each task, of several the first."""
-    best: dict[str, Shown] = {}
-    for one in shown:
-        if one.task not in best or one.run["score"] > best[one.task].run["score"]:
-            best[one.task] = one
-    return best
-
-
-def present(shown: Shown, out: Path) -> dict[str, str]:
-    """Return the existing pictures of a configuration.
-
-    Args:
-        shown: The configuration.
-        out: Folder of the page.
-
-    Returns:
-        Paths relative to ``out`` by subject: ``start``, ``target``, ``<method>``, ``<method> film``.
-    """
-    folder = out / FOLDER / shown.folder
-    names = {"start": "start.webp", "target": "target.webp"}
-    names |= {method: f"{shown.stem(method)}.webp" for method in shown.drawn}
-    names |= {f"{method} film": f"{shown.stem(method)}.mp4" for method in shown.films}
-    there = {what: folder / name for what, name in names.items()}
-    return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
-
-
-def missing_pictures(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
-    """Return the pictures to draw.
-
-    Args:
-        shown: The configurations.
-        out: Folder of the page.
-
-    Returns:
-        For missing folders, result files by the stems of picture names, and whether each has a film.
-    """
-    folders = {out / FOLDER / one.folder: one for one in shown}
-    return {
-        folder: {
-            one.stem(name): (Path(one.runs[name]["path"]), name in one.films) for name in sorted(one.drawn)
-        }
-        for folder, one in folders.items()
-        if not folder.is_dir()
-    }
-
-
-def remove_earlier(shown: Sequence[Shown], out: Path) -> None:
-    """Remove pictures of runs that have been surpassed, once those of the best runs exist."""
-    for one in shown:
-        current = out / FOLDER / one.folder
-        if current.is_dir():
-            for folder in (out / FOLDER).glob(f"{one.name}-{'[0-9a-f]' * 8}"):
-                if folder != current:
-                    shutil.rmtree(folder)
 
 
 # -------------------------------------------------------------------------------------------------- templates

@@ -115,13 +115,10 @@ Strata = Sequence[np.ndarray]
 def interquartile_mean(strata: Strata) -> Interval:
     """Return the interquartile mean of all scores, with its percentile interval."""
 
-    def middle(samples: np.ndarray) -> np.ndarray:
-        # As SciPy's trim_mean, which takes longer to import than all tables take to compute.
-        count = samples.shape[1]
-        cut = count // 4
-        return np.sort(samples, axis=1)[:, cut : count - cut].mean(axis=1)
-
-    return _interval(middle(np.concatenate(strata)[None])[0], middle(_resampled(strata)))
+    scores, samples = np.concatenate(strata), _resampled(strata)
+    middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
+    found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
+    return _interval(*found)
 
 
 def performance_profile(strata: Strata, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -225,9 +222,9 @@ def common_strata(
 ) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
     """Return configurations with runs of several methods, and the scores of these methods.
 
-    Methods are removed one by one: each time the one whose removal leaves the most common configurations,
-    with ties broken by fewest configurations. The methods and configurations with the largest number of pairs
-    are selected: at least two methods, if any two share a configuration.
+    Methods are added in the order of the configurations that they share with the one that has most. As many
+    are selected as give the largest number of pairs of a method and a common configuration, at least two if
+    any share a configuration.
 
     Args:
         scores: By method and configuration, shape [run] each.
@@ -235,17 +232,15 @@ def common_strata(
     Returns:
         The configurations; and by method the scores of each of them.
     """
-    left = {name: set(own) for name, own in scores.items()}
-    best: tuple[int, dict[str, set[tuple[str, str]]]] = (0, {})
-    while left and not (len(left) < 2 and best[0]):
-        size = len(left) * len(set.intersection(*left.values()))
-        if size > best[0]:
-            best = size, dict(left)
-        others = {name: [own for other, own in left.items() if other != name] for name in left}
-        shared = {name: len(set.intersection(*own)) if own else 0 for name, own in others.items()}
-        del left[max(left, key=lambda name: (shared[name], -len(left[name])))]
-    keys = sorted(set.intersection(*best[1].values())) if best[1] else []
-    return keys, {name: [scores[name][key] for key in keys] for name in best[1]}
+    if not scores:
+        return [], {}
+    most = max(scores.values(), key=len)
+    order = sorted(scores, key=lambda name: -len(scores[name].keys() & most.keys()))
+    common = [set.intersection(*(set(scores[name]) for name in order[: k + 1])) for k in range(len(order))]
+    shared = (k for k in range(len(order)) if common[k])
+    last = max(shared, key=lambda k: (k > 0, (k + 1) * len(common[k]), k))
+    keys, shown = sorted(common[last]), set(order[: last + 1])
+    return keys, {name: [own[key] for key in keys] for name, own in scores.items() if name in shown}
 
 
 # ------------------------------------------------------------------------------------------------ iterations

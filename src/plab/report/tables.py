@@ -49,7 +49,7 @@ class Table:
 
     Attributes:
         name: Name of its files.
-        form: ``ours``, ``paper`` or ``comparison``: its folder.
+        form: ``ours`` or ``comparison`` (with the paper): its folder.
         title: Heading.
         cells: Text of the table.
         data: CSV rows with all digits, one per number or group of numbers.
@@ -196,12 +196,12 @@ def ends(interval: Interval, decimals: int = 2) -> str:
 
 
 def iou_per_task(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per task and method: ours, the paper's, and a comparison."""
+    """Return normalised incremental IoU per task and method: ours, and compared with the paper's."""
     return _iou_tables(runs, "task", "over variants and seeds")
 
 
 def iou_per_configuration(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per configuration and method: ours, the paper's, and a comparison."""
+    """Return normalised incremental IoU per configuration and method: ours, and compared with the paper's."""
     return _iou_tables(runs, "configuration", "over seeds")
 
 
@@ -216,7 +216,7 @@ def distances(runs: Runs) -> list[Table]:
             own = runs.table.query("task == @task and method == @m")[name].dropna()
             found = summarise(own.to_numpy(float))
             line.append(mean_and_std(found, 3) if found.count else NOTHING)
-            data.append({"task": task, "distance": name, "method": m, **_numbers(found, 0)})
+            data.append({"task": task, "distance": name, "method": m, **_numbers(found)})
         shown.append(line)
     labels = ["task", "distance", *(method(m).label for m in runs.methods)]
     notes = ["Mean ± standard deviation over variants and seeds [domain units].", *settings_note(runs)]
@@ -233,48 +233,38 @@ def distances(runs: Runs) -> list[Table]:
 
 
 def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
-    """Return the three forms of a table of scores; ``what`` describes the runs of means and spreads."""
+    """Return both forms of a table of scores; ``what`` describes the runs of means and spreads."""
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
     columns = ["task", "variant"][: 1 if unit == "task" else 2]
     cells = compare(runs, unit)
-    keys = list(dict.fromkeys(key[:-1] for key in cells))
-    printed = [m for m in runs.methods if _in_paper(m)]
-    made = []
-    for form, owner, methods, more in (
-        ("ours", "plab", runs.methods, [_INCOMPLETE, *settings_note(runs)]),
-        ("paper", "the paper", printed, []),
-    ):
-        shown, data, bold = [], [], []
-        for key in keys:
-            line = [cells[(*key, m)] for m in methods]
-            sides = [(cell.ours, cell.expected) if form == "ours" else (cell.paper, 0) for cell in line]
-            shown.append([*key, *(_text(*side) for side in sides)])
-            where = dict(zip(columns, key, strict=True))
-            data += [
-                {**where, "method": m, **_numbers(*side)} for m, side in zip(methods, sides, strict=True)
-            ]
-            bold.append([False] * len(columns) + _best(sides, methods))
-        labels = [*columns, *(method(m).label for m in methods)]
-        notes = [f"Mean ± standard deviation {what}.", _BOLD, *more]
-        made.append(
-            Table(
-                *(name, form, f"{title}, {owner}", pd.DataFrame(shown, columns=labels), pd.DataFrame(data)),
-                *(np.array(bold), notes, len(keys) > 60),
-            )
-        )
-    compared, data = [], []
-    for key, m in itertools.product(keys, printed):
-        where, cell = dict(zip(columns, key, strict=True)), cells[(*key, m)]
-        gap = cell.difference
-        texts = {"plab": _text(cell.ours, cell.expected), "paper": _text(cell.paper, 0)}
-        texts |= {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)}
-        compared.append(where | {"method": method(m).label} | texts)
-        own = {f"paper_{k}": v for k, v in _numbers(cell.paper, 0).items()}
-        gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
-        data.append({**where, "method": m, **_numbers(cell.ours, cell.expected), **own, **gaps})
-    notes = [_DIFFERENCE, *settings_note(runs)]
-    shown, title = pd.DataFrame(compared), f"{title}, compared"
-    return [*made, Table(name, "comparison", title, shown, pd.DataFrame(data), None, notes, True)]
+    shown, bold, data, compared, differences = [], [], [], [], []
+    for key in dict.fromkeys(key[:-1] for key in cells):
+        line, where = [cells[(*key, m)] for m in runs.methods], dict(zip(columns, key, strict=True))
+        shown.append([*key, *(_text(cell.ours, cell.expected) for cell in line)])
+        bold.append([False] * len(columns) + _best(line, runs.methods))
+        for m, cell in zip(runs.methods, line, strict=True):
+            data.append({**where, "method": m, **_numbers(cell.ours), "expected": cell.expected})
+            if not _in_paper(m):
+                continue
+            gap = cell.difference
+            texts = {"plab": _text(cell.ours, cell.expected), "paper": _text(cell.paper, 0)}
+            texts |= {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)}
+            compared.append(where | {"method": method(m).label} | texts)
+            theirs = {f"paper_{k}": value for k, value in _numbers(cell.paper).items()}
+            gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
+            differences.append({**data[-1], **theirs, **gaps})
+    labels = [*columns, *(method(m).label for m in runs.methods)]
+    mean, settings = f"Mean ± standard deviation {what}.", settings_note(runs)
+    return [
+        Table(
+            *(name, "ours", f"{title}, plab", pd.DataFrame(shown, columns=labels), pd.DataFrame(data)),
+            *(np.array(bold), [mean, _BOLD, _INCOMPLETE, *settings], len(shown) > 60),
+        ),
+        Table(
+            *(name, "comparison", f"{title}, compared", pd.DataFrame(compared), pd.DataFrame(differences)),
+            *(None, [_DIFFERENCE, *settings], True),
+        ),
+    ]
 
 
 def _text(summary: Summary, expected: int) -> str:
@@ -285,23 +275,21 @@ def _text(summary: Summary, expected: int) -> str:
     return mean_and_std(summary) + (f" ({count})" if summary.count < expected else "")
 
 
-def _numbers(summary: Summary, expected: int) -> dict[str, float]:
+def _numbers(summary: Summary) -> dict[str, float]:
     """Return values by column of a CSV file."""
-    values = {"mean": summary.mean, "std": summary.std, "runs": summary.count}
-    return values | ({"expected": expected} if expected else {})
+    return {"mean": summary.mean, "std": summary.std, "runs": summary.count}
 
 
-def _best(line: Sequence[tuple[Summary, int]], methods: Sequence[str]) -> list[bool]:
+def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
     """Return the mask of the best cells per kind of method, as printed; none if a cell is incomplete."""
     best = [False] * len(line)
     for kind in (RL, GRADIENT):
-        rivals = [
-            k for k, m in enumerate(methods) if method(m).kind == kind and (_in_paper(m) or line[k][0].count)
-        ]
-        if rivals and all(line[k][0].count >= max(line[k][1], 1) for k in rivals):
-            highest = max(round(line[k][0].mean, 2) for k in rivals)
+        own = [k for k, m in enumerate(methods) if method(m).kind == kind]
+        rivals = [k for k in own if _in_paper(methods[k]) or line[k].ours.count]
+        if rivals and all(line[k].ours.count >= line[k].expected for k in rivals):
+            highest = max(round(line[k].ours.mean, 2) for k in rivals)
             for k in rivals:
-                best[k] = round(line[k][0].mean, 2) == highest
+                best[k] = round(line[k].ours.mean, 2) == highest
     return best
 
 
@@ -381,8 +369,6 @@ def in_all(cells: pd.DataFrame) -> dict[str, float]:
 
 # ------------------------------------------------------------------------------------------------ solvability
 
-_DEMONSTRATIONS = "Normalised incremental IoU of the best known actions, replayed in the hard contact model."
-
 
 def solvability(runs: Runs) -> list[Table]:
     """Return the scores of the demonstrations beside those of the paper's best method."""
@@ -413,31 +399,18 @@ def solvability(runs: Runs) -> list[Table]:
     )
     data[["difference", "low", "high"]] = [(gap.value, gap.low, gap.high) for gap in gaps]
     notes = [
-        _DEMONSTRATIONS,
+        "Normalised incremental IoU of the best known actions, replayed in the hard contact model.",
         "Our targets are made from their parameters or by scripts, the paper's are files, so the two columns "
         "judge somewhat different goals. The interval is Student's t over the paper's seeds.",
     ]
-    ours, theirs = "What the reference demonstrations reach", "What the best method of the paper reaches"
-    compared = "Demonstrations beside the best method of the paper"
-    return [
-        _solvability_grid(data, "ours", "score", ours, _DEMONSTRATIONS),
-        _solvability_grid(data, "paper", "paper_mean", theirs, "Mean over seeds."),
-        Table("solvability", "comparison", compared, cells, data, None, notes, True),
-    ]
+    title = "Demonstrations beside the best method of the paper"
+    return [Table("solvability", "comparison", title, cells, data, None, notes, True)]
 
 
 def demonstration_scores() -> pd.DataFrame:
     """Return the scores of the reference demonstrations, columns task, variant and score."""
     with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file, dtype={"variant": str})
-
-
-def _solvability_grid(data: pd.DataFrame, form: str, column: str, title: str, note: str) -> Table:
-    grid = data.pivot(index="task", columns="variant", values=column).loc[list(dict.fromkeys(data["task"]))]
-    cells = grid.map(number).rename(columns=lambda variant: f"variant {variant}").reset_index()
-    cells.columns.name = None
-    columns = ["task", "variant", column, *(["paper_method"] if form == "paper" else [])]
-    return Table("solvability", form, title, cells, data[columns], notes=[note])
 
 
 # ---------------------------------------------------------------------------------------------- equal budgets
@@ -492,7 +465,7 @@ _TIMES = (
 
 
 def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Return times per environment step and task: ours, the paper's, and a comparison.
+    """Return times per environment step and task: ours, and compared with the paper's.
 
     Args:
         runs: Our runs.
@@ -521,15 +494,10 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
             where = f"benchmark, {', '.join(where)}, batch {row['batch']}"
             for column, kind, name in _BENCHMARK:
                 compared.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
-    theirs = paper.loc[[task for task in tasks if task in paper.index]].reset_index()
-    printed_cells = {"task": theirs["task"], "forward [ms]": theirs["forward_ms"].map(number)}
-    printed_cells["forward + backward [ms]"] = theirs["forward_backward_ms"].map(number)
-    title, notes = "Time per environment step", [_TIMES, *settings_note(runs)]
-    shown, numbers = pd.DataFrame(cells), pd.DataFrame(data)
-    papers = ["On a GTX 1080 Ti."]
+    notes = [_TIMES, *settings_note(runs)]
+    ours, title = pd.DataFrame(cells), "Time per environment step, plab"
     return [
-        Table("timing", "ours", f"{title}, plab", shown, numbers, notes=notes),
-        Table("timing", "paper", f"{title}, the paper", pd.DataFrame(printed_cells), theirs, notes=papers),
+        Table("timing", "ours", title, ours, pd.DataFrame(data), notes=notes),
         _compared_times(compared, [*origin(benchmark), *settings_note(runs)]),
     ]
 
@@ -593,49 +561,30 @@ _GRADIENT_KEYS = {
 
 
 def hyperparameters() -> list[Table]:
-    """Return the settings of all methods: ours, the paper's, and a comparison."""
+    """Return the settings of all methods: ours beside the paper's."""
     data = pd.DataFrame([*_rl_rows(), *_gradient_rows()])
     shown = data.replace("", NOTHING).assign(method=data["method"].map(lambda name: method(name).label))
-    ours = shown[["method", "key", "plab", "remark"]].rename(columns={"plab": "value"})
-    names = {"paper": "value", "paper remark": "remark"}
-    theirs = shown[["method", "key", "paper", "paper remark"]].rename(columns=names)
-    both = shown[["method", "key", "plab", "paper"]]
-    bold = np.zeros(both.shape, dtype=bool)
+    bold = np.zeros(shown.shape, dtype=bool)
     bold[:, 2:] = ((data["plab"] != data["paper"]) & data["paper"].ne("")).to_numpy()[:, None]
-    our_note = "As in conf/method/, profile release: the authors' code."
-    their_note = (
-        "RL methods: conf/method/, profile paper, as far as the paper prints it. Gradient methods: the "
-        "authors' code, and the paper's decay rate of the soft contact."
-    )
-    note = "Bold: not the same. A dash: not printed."
-    return [
-        Table(
-            "hyperparameters", form, f"Hyper-parameters, {whose}", cells, data[columns], bolds, [said], True
-        )
-        for form, whose, cells, columns, bolds, said in (
-            ("ours", "plab", ours, ["method", "key", "plab"], None, our_note),
-            ("paper", "the paper", theirs, ["method", "key", "paper"], None, their_note),
-            ("comparison", "compared", both, list(data), bold, note),
-        )
+    notes = [
+        "plab: conf/method/, profile release, the authors' code. Paper: profile paper, as far as it is "
+        "printed; of gradient methods the authors' code, and the paper's decay rate of the soft contact.",
+        "Bold: not the same. A dash: not printed.",
     ]
+    title = "Hyper-parameters, compared"
+    return [Table("hyperparameters", "comparison", title, shown, data, bold, notes, True)]
 
 
 def _rl_rows() -> Iterator[dict[str, str]]:
     for name in RL_METHODS:
         text = (conf_folder() / "method" / f"{name}.yaml").read_text(encoding="utf-8")
         profiles = yaml.safe_load(text)["profiles"]
-        remarks, printed = _comments(text, "release"), _comments(text, "paper")
+        # The comment on each value of the profile says whether the paper prints it.
+        paper = re.split(r"\n(?!    )", text.split("\n  paper:", 1)[1], maxsplit=1)[0]
+        printed = re.findall(r"^    (\w+):.*?#\s*(?!not printed|\s)(?=.*printed)", paper, re.MULTILINE)
         for key, value in profiles["release"].items():
-            remark = printed.get(key, "")
-            is_printed = "printed" in remark and not remark.startswith("not printed")
-            yield {
-                "method": name,
-                "key": key,
-                "plab": _value(value),
-                "paper": _value(profiles["paper"][key]) if is_printed else "",
-                "remark": remarks.get(key, ""),
-                "paper remark": remark,
-            }
+            theirs = _value(profiles["paper"][key]) if key in printed else ""
+            yield {"method": name, "key": key, "plab": _value(value), "paper": theirs}
 
 
 def _gradient_rows() -> Iterator[dict[str, str]]:
@@ -643,30 +592,14 @@ def _gradient_rows() -> Iterator[dict[str, str]]:
     from plab.config import load_config
 
     paper = paper_table("gradient_settings").set_index(["method", "key"])["value"]
-    remarks = _comments((conf_folder() / "method" / "adam.yaml").read_text(encoding="utf-8"), None)
     for name, keys in _GRADIENT_KEYS.items():
         content = load_config([f"method={name}"]).method
         for key in keys:
             value = getattr(content, key)
             rates = shipped_file("method", name)["lr_by_task"]["plab"] if key == "lr" else {}
             exceptions = [f"; {_value(rate)} on {task}" for task, rate in rates.items() if rate != value]
-            yield {
-                "method": name,
-                "key": key,
-                "plab": _value(value),
-                "paper": _value(yaml.safe_load(str(paper[name, key]))),
-                "remark": remarks.get(key, "") + "".join(exceptions),
-                "paper remark": "",
-            }
-
-
-def _comments(text: str, profile: str | None) -> dict[str, str]:
-    """Return the comment on each key of a file, or of one of its profiles."""
-    indent = ""
-    if profile is not None:
-        indent = "    "
-        text = re.split(r"\n(?!    )", text.split(f"\n  {profile}:", 1)[1], maxsplit=1)[0]
-    return dict(re.findall(rf"^{indent}(\w+):.*?#\s*(.*)", text, re.MULTILINE))
+            theirs = _value(yaml.safe_load(str(paper[name, key])))
+            yield {"method": name, "key": key, "plab": _value(value) + "".join(exceptions), "paper": theirs}
 
 
 def _value(value: Any) -> str:

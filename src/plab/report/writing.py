@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 import plab
-from plab.report.collect import Ablation, Runs
-from plab.report.statistics import load_rows, load_series
+from plab.report.collect import Runs
+from plab.report.statistics import load_series
 from plab.report.tables import (
     MINUS,
     NOTHING,
@@ -35,12 +34,12 @@ if TYPE_CHECKING:
 
 
 def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Write all tables.
+    """Write all tables as LaTeX and CSV, ``tables.tex`` and ``tables.md`` with all of them, and their origin.
 
     Args:
         runs: Our runs.
         out: Folder to write to.
-        command: Command that makes them, for their footers.
+        command: Command that makes them.
         benchmark: Table of ``plab bench speed --paper --csv``, or None.
 
     Returns:
@@ -56,27 +55,26 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
         *score_at_budget(runs, load_series(runs)),
         *hyperparameters(),
     ]
-    from_runs = origin(runs, command, deep=True)
-    from_paper = {"command": command, "footer": [f"Made by: {command}"]}
-    _write_runs(runs, out)
+    made = _footer(runs, command)
     for table in tables:
-        uses_runs = table.form != "paper" and table.name not in ("solvability", "hyperparameters")
-        write_table(table, out, from_runs if uses_runs else from_paper)
-    write_index(tables, out)
+        path = out / table.file
+        replace_file(path.with_suffix(".tex"), "".join(f"% {line}\n" for line in made) + latex(table))
+        numbers = table.data.to_csv(index=False, lineterminator="\n")
+        replace_file(path.with_suffix(".csv"), "".join(f"# {line}\n" for line in made) + numbers)
+    inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in tables)
+    replace_file(out / "tables.tex", _DOCUMENT.replace("INPUTS", inputs))
+    replace_file(out / "tables.md", "\n".join([*map(markdown, tables), *(f"{line}  " for line in made), ""]))
+    replace_file(out / "runs.json", json.dumps(origin(runs, command), indent=1) + "\n")
     return tables
 
 
-def write_curves(
-    runs: Runs, ablation: Ablation | None, out: Path, command: str, errors: pd.DataFrame | None = None
-) -> list[Drawing]:
-    """Draw all figures with data.
+def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
+    """Draw all figures with data, and write them as PDF and PNG; and their notes and origin.
 
     Args:
         runs: Our runs.
-        ablation: Runs that differ in the yield stress, or None.
         out: Folder to write to.
-        command: Command that makes them, for their metadata.
-        errors: Table of ``plab bench accuracy``, or None.
+        command: Command that makes them.
 
     Returns:
         The figures.
@@ -96,70 +94,28 @@ def write_curves(
                 *figures.agreement_plot(runs),
                 *figures.aggregates(runs),
             ]
-        if ablation is not None:
-            groups = {value: [load_rows(path) for path in paths] for value, paths in ablation.paths.items()}
-            what = f"{ablation.task}-v{ablation.variant}"
-            drawings += figures.yield_ablation(groups, what, ablation.method)
-        if errors is not None and (drawing := figures.work_precision(errors)) is not None:
-            drawings.append(drawing)
-        _write_runs(runs, out)
-        figures.save(drawings, out, origin(runs, command, deep=False))
+        figures.save(drawings, out, " | ".join(_footer(runs, command)))
+    replace_file(out / "runs.json", json.dumps(origin(runs, command), indent=1) + "\n")
     return drawings
 
 
-def origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
-    """Return the origin of tables or figures; ``deep``: for files in a subfolder."""
-    digest = runs.digest
-    footer = [f"Made by: {command}", f"From {len(runs.table)} run(s), SHA-256 over them {digest}"]
+def origin(runs: Runs, command: str) -> dict[str, Any]:
+    """Return the origin of tables, figures or the page: command, version, digest and files of the runs."""
+    columns = ["task", "variant", "method", "seed", "config_hash", "path"]
     return {
-        "footer": footer,
         "command": command,
         "plab": plab.__version__,
-        "digest": digest,
-        **{name: getattr(runs, name) for name in ("unfinished", "others", "set_aside")},
-        "unusual": [vars(setting) for setting in runs.unusual],
-        "runs": "../runs.json" if deep else "runs.json",
+        "digest": runs.digest,
+        **{name: getattr(runs, name) for name in ("unfinished", "others", "set_aside", "unusual")},
+        "runs": runs.table[columns].to_dict("records") if len(runs.table) else [],
     }
 
 
-def _write_runs(runs: Runs, out: Path) -> None:
-    """Write the list of result files, once for all tables or figures."""
-    known = runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else []
-    replace_file(out / "runs.json", json.dumps(known, indent=1) + "\n")
+def _footer(runs: Runs, command: str) -> list[str]:
+    return [f"Made by: {command}", f"From {len(runs.table)} run(s), SHA-256 over them {runs.digest}"]
 
 
 # ----------------------------------------------------------------------------------------- formats of tables
-
-
-def write_table(table: Table, folder: Path, origin: Mapping[str, Any]) -> None:
-    """Write LaTeX, Markdown and CSV files, with a JSON file of the provenance.
-
-    Args:
-        table: The table.
-        folder: Folder of tables.
-        origin: Origin of the table, see :func:`plab.report.writing.origin`; ``footer`` is a list of lines
-            for the files themselves.
-    """
-    path = folder / table.file
-    footer = [str(line) for line in origin["footer"]]
-    files = {
-        ".tex": "".join(f"% {line}\n" for line in footer) + _latex(table),
-        ".md": _markdown(table, footer),
-        ".csv": "".join(f"# {line}\n" for line in footer)
-        + table.data.to_csv(index=False, lineterminator="\n"),
-        ".json": json.dumps({"title": table.title, "notes": table.notes, **origin}, indent=1) + "\n",
-    }
-    for suffix, text in files.items():
-        replace_file(path.with_suffix(suffix), text)
-
-
-def write_index(tables: list[Table], folder: Path) -> None:
-    """Write ``tables.tex``, a document with all of them, and ``tables.md``."""
-    inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in tables)
-    replace_file(folder / "tables.tex", _DOCUMENT.replace("INPUTS", inputs))
-    text = "\n".join((folder / table.file).with_suffix(".md").read_text(encoding="utf-8") for table in tables)
-    replace_file(folder / "tables.md", text)
-
 
 _DOCUMENT = r"""% pdflatex tables.tex, twice: long tables align their columns the second time.
 \documentclass{article}
@@ -173,39 +129,24 @@ INPUTS
 \end{document}
 """
 
-_LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"}
-"""Symbols that need LaTeX commands."""
+_LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"} | {sign: f"\\{sign}" for sign in "&%$#_{}"}
+_TO_LATEX = str.maketrans(_LATEX_SIGNS)
 
 
-_COLUMN = {"remark": r"p{0.55\linewidth}"}
-"""Columns of running text; all others have their natural width."""
-
-
-def _latex_text(text: str) -> str:
-    for sign in "&%$#_{}":
-        text = text.replace(sign, f"\\{sign}")
-    for sign, replacement in _LATEX_SIGNS.items():
-        text = text.replace(sign, replacement)
-    return text
-
-
-def _latex(table: Table) -> str:
-    """Return a table environment for ``\\input``, which needs booktabs, graphicx, longtable.
-
-    A table wider than the page is scaled down, or set in a smaller font if it is long.
-    """
-    cells = table.cells.map(_latex_text).rename(columns=_latex_text)
+def latex(table: Table) -> str:
+    """Return a table environment for ``\\input``, which needs booktabs, graphicx, longtable; short tables are
+    scaled down to the width of the page."""
+    cells = table.cells.map(lambda text: text.translate(_TO_LATEX))
+    cells = cells.rename(columns=lambda text: text.translate(_TO_LATEX))
     style = cells.style.hide(axis="index")
     if table.bold is not None:
         weights = np.where(table.bold, "font-weight: bold", "")
-        style = style.apply(lambda _: pd.DataFrame(weights, cells.index, cells.columns), axis=None)
-    size = r"\footnotesize" if len(cells) > 15 or len(cells.columns) > 6 else r"\small"
-    caption = _latex_text(" ".join([f"{table.title}.", *table.notes]))
+        style = style.apply(lambda _: weights, axis=None)
     text = style.to_latex(
-        column_format="".join(map(_COLUMN.get, table.cells.columns, aligned(table.cells))),
+        column_format="".join(aligned(table.cells)),
         hrules=True,
         convert_css=True,
-        caption=caption,
+        caption=" ".join([f"{table.title}.", *table.notes]).translate(_TO_LATEX),
         label=f"tab:{table.form}-{table.name}".replace("_", "-"),
         environment="longtable" if table.long else "table",
         position=None if table.long else "htbp",
@@ -214,37 +155,19 @@ def _latex(table: Table) -> str:
     if table.long:
         # Later pages have no caption.
         text = re.sub(r"\\caption\[\].*\n", "", text)
-        if _characters(table) > _WIDEST:
-            size = r"\tiny\setlength{\tabcolsep}{3pt}"
+        size = r"\tiny\setlength{\tabcolsep}{3pt}" if len(cells.columns) > 7 else r"\footnotesize"
         return f"{{{size}\n{text}}}\n"
-    text = text.replace("\\centering\n", f"\\centering\n{size}\n", 1)
     fitted = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%" + "\n"
     text = text.replace(r"\begin{tabular}", fitted + r"\begin{tabular}", 1)
     return text.replace(r"\end{tabular}", r"\end{tabular}}", 1)
 
 
-_WIDEST = 115
-"""Number of characters per row, with three per gap, that fit on a page in footnote size."""
-
-
-def _characters(table: Table) -> int:
-    widths = [
-        0 if name in _COLUMN else max(map(len, [str(name), *table.cells[name].astype(str)]))
-        for name in table.cells
-    ]
-    running = sum(name in _COLUMN for name in table.cells)
-    return sum(widths) + 3 * len(widths) + 65 * running
-
-
-_RULES = {"l": "---", "r": "---:"}
-
-
-def _markdown(table: Table, footer: list[str]) -> str:
+def markdown(table: Table) -> str:
+    """Return a table in Markdown with its title and notes."""
     cells = table.cells.to_numpy(dtype=str)
     if table.bold is not None:
         cells = np.where(table.bold, np.char.add(np.char.add("**", cells), "**"), cells)
-    lines = [list(table.cells.columns), [_RULES[side] for side in aligned(table.cells)], *cells.tolist()]
+    rules = ["---:" if side == "r" else "---" for side in aligned(table.cells)]
+    lines = [list(table.cells.columns), rules, *cells.tolist()]
     body = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    notes = f"\n{' '.join(table.notes)}\n" if table.notes else ""
-    made = "".join(f"<sub>{line}</sub>  \n" for line in footer)
-    return f"## {table.title}\n\n{body}{notes}\n{made}"
+    return f"## {table.title}\n\n{body}\n{' '.join(table.notes)}\n"

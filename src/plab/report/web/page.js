@@ -1,9 +1,7 @@
-// What is shown at which address, and the page made again.
+// What is shown at which address.
 globalThis.plab = {
   /** Called by data/<configuration>.js. */
   receive: (name, details) => { received.set(name, details); },
-  /** Called by data/state.js: the page that is there now. */
-  state: (name) => { if (name !== content.state) location.reload(); },
 };
 
 function route() {
@@ -20,12 +18,3 @@ showTasks();
 showAggregates();
 showOverview();
 route();
-
-if (content.live) {
-  // A page from the file system may ask nothing but scripts whether there is a newer one.
-  setInterval(() => {
-    const script = make("script", { src: `data/state.js?${Date.now()}` });
-    for (const what of ["load", "error"]) script.addEventListener(what, () => script.remove());
-    document.head.append(script);
-  }, content.every);
-}

@@ -38,7 +38,7 @@ function showGallery() {
   });
   const grid = make("div", { class: "pictures small" }, ...figures);
   const lacking = content.gallery.filter(({ name }) => !pictureOf(name).start).map(({ task }) => task);
-  const note = lacking.length ? make("p", { class: "note" }, `No pictures of ${lacking.join(", ")}${content.live ? " yet" : ""}.`) : "";
+  const note = lacking.length ? make("p", { class: "note" }, `No pictures of ${lacking.join(", ")}.`) : "";
   find("#gallery").replaceChildren(...(figures.length ? [make("div", { class: "heading" }, make("h2", {}, "The best run of each task"), playAll(grid) ?? ""), grid, note] : []));
 }
 const pictureOf = (name) => configurations.find((one) => one.name === name).pictures;
