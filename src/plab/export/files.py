@@ -5,7 +5,7 @@ Files are written by VTK, through PyVista.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
@@ -15,20 +15,10 @@ import pyvista as pv
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from plab.progress import show_progress
-from plab.render.renderer import (
-    BODY_COLORS,
-    MANIPULATOR_COLOR,
-    TARGET_COLOR,
-    surface_mesh,
-    target_mesh,
-)
+from plab.render.renderer import BODY_COLORS, MANIPULATOR_COLOR, TARGET_COLOR
 from plab.render.rollouts import RecordedRollout
-from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.render.surface import body_slices, body_surfaces
+from plab.render.shapes import body_meshes, manipulator_parts, pose_matrix, target_mesh
 from plab.results.run_file import replace_file
-
-Things = Callable[[int], Mapping[str, pv.PolyData]]
-"""Function that returns the meshes of a step, by name."""
 
 
 def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
@@ -44,8 +34,11 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     """
     scene = recording.scene
     series: dict[str, dict[float, str]] = {}
-    for step, things in _frames(recording, every, _vtk_things):
-        for name, mesh in things.items():
+    for step, surfaces in _frames(recording, every):
+        particles = pv.PolyData(recording.x[step])
+        for name, values in quantities(recording, step).items():
+            particles[name] = values
+        for name, mesh in {"particles": particles, **surfaces}.items():
             file = f"{name}_{step:04d}.vtp"
             _save_vtp(mesh, folder / file)
             series.setdefault(name, {})[step * scene.substeps * scene.dt] = file
@@ -55,8 +48,8 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
         for time, file in files.items():
             ElementTree.SubElement(collection, "DataSet", timestep=f"{time:.9g}", part="0", file=file)
         ElementTree.ElementTree(root).write(folder / f"{name}.pvd", encoding="utf-8", xml_declaration=True)
-    if (target := _target(recording)) is not None:
-        _save_vtp(target, folder / "target.vtp")
+    if recording.target_mass is not None:
+        _save_vtp(target_mesh(scene, recording.target_mass), folder / "target.vtp")
 
 
 def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
@@ -70,24 +63,41 @@ def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
         every: Environment steps from one frame to the next.
     """
     colors = {"plasticine": ("body", BODY_COLORS), "manipulators": ("manipulator", (MANIPULATOR_COLOR,))}
-    for step, things in _frames(recording, every, _surfaces):
-        for name, mesh in things.items():
+    for step, surfaces in _frames(recording, every):
+        for name, mesh in surfaces.items():
             numbers, palette = colors[name]
             _save_ply(mesh, mesh[numbers], palette, folder / f"{name}_{step:04d}.ply")
-    if (target := _target(recording)) is not None:
+    if recording.target_mass is not None:
+        target = target_mesh(recording.scene, recording.target_mass)
         _save_ply(target, np.zeros(target.n_points, int), (TARGET_COLOR,), folder / "target.ply")
 
 
-def _frames(
-    recording: RecordedRollout, every: int, things: Callable[[RecordedRollout], Things]
-) -> Iterator[tuple[int, Mapping[str, pv.PolyData]]]:
-    """Yield steps and their meshes, by name."""
-    last = len(recording.x) - 1
-    at = things(recording)
+def _frames(recording: RecordedRollout, every: int) -> Iterator[tuple[int, dict[str, pv.PolyData]]]:
+    """Yield steps, and the surfaces of plasticine and manipulators by name."""
+    scene, last = recording.scene, len(recording.x) - 1
+    parts = [(number, part) for number, m in enumerate(scene.manipulators) for part in manipulator_parts(m)]
     with show_progress("export", 0, last) as report:
         for step in sorted({*range(0, last, every), last}):
-            yield step, at(step)
+            poses = recording.poses[step]
+            rigid = [p.mesh.transform(pose_matrix(poses[k], p.side), inplace=False) for k, p in parts]
+            clay = enumerate(body_meshes(scene, recording.x[step]))
+            yield (
+                step,
+                {
+                    "plasticine": _merged(clay, "body"),
+                    "manipulators": _merged(zip([k for k, _ in parts], rigid, strict=True), "manipulator"),
+                },
+            )
             report(step, "")
+
+
+def _merged(meshes: Iterable[tuple[int, pv.PolyData]], name: str) -> pv.PolyData:
+    """Merge numbered meshes into one, with their numbers at its points."""
+    found = []
+    for number, mesh in meshes:
+        mesh[name] = np.full(mesh.n_points, number)
+        found.append(mesh)
+    return pv.merge(found, merge_points=False)
 
 
 def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], path: Path) -> None:
@@ -107,21 +117,6 @@ def _save_vtp(mesh: pv.PolyData, path: Path) -> None:
     writer.WriteToOutputStringOn()
     writer.Write()
     replace_file(path, writer.GetOutputString())
-
-
-# ----------------------------------------------------------------------------------------------------- things
-
-
-def _vtk_things(recording: RecordedRollout) -> Things:
-    surfaces = _surfaces(recording)
-
-    def at(step: int) -> Mapping[str, pv.PolyData]:
-        particles = pv.PolyData(recording.x[step])
-        for name, values in quantities(recording, step).items():
-            particles[name] = values
-        return {"particles": particles, **surfaces(step)}
-
-    return at
 
 
 def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
@@ -152,37 +147,3 @@ def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
         "elastic_strain": strain,
         "yielding": np.minimum(strain / np.array(limits)[body], 1.0),
     }
-
-
-def _surfaces(recording: RecordedRollout) -> Things:
-    scene = recording.scene
-    bodies = list(zip(body_slices(scene), body_surfaces(scene), strict=True))
-    parts = [
-        (number, part.side, part.mesh)
-        for number, manipulator in enumerate(scene.manipulators)
-        for part in manipulator_parts(manipulator)
-    ]
-
-    def at(step: int) -> Mapping[str, pv.PolyData]:
-        x, poses = recording.x[step], recording.poses[step]
-        clay = [surface_mesh(surface.field(x[at])) for at, surface in bodies]
-        rigid = [mesh.transform(pose_matrix(poses[k], side), inplace=False) for k, side, mesh in parts]
-        return {
-            "plasticine": _merged(clay, range(len(clay)), "body"),
-            "manipulators": _merged(rigid, [k for k, *_ in parts], "manipulator"),
-        }
-
-    return at
-
-
-def _merged(meshes: Sequence[pv.PolyData], numbers: Sequence[int], name: str) -> pv.PolyData:
-    """Merge meshes into one, with the number of the original mesh at each point."""
-    for number, mesh in zip(numbers, meshes, strict=True):
-        mesh[name] = np.full(mesh.n_points, number)
-    return pv.merge(meshes, merge_points=False)
-
-
-def _target(recording: RecordedRollout) -> pv.PolyData | None:
-    """Return the target's surface, if there is a target."""
-    mass = recording.target_mass
-    return None if mass is None else target_mesh(recording.scene, mass)

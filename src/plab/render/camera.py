@@ -62,14 +62,15 @@ def scene_camera(
         poses: Poses of the manipulators, shape [time, manipulator, 8]; those at t = 0 if None.
     """
     # Imported here: fit_camera needs no PyVista.
-    from plab.render.shapes import manipulator_parts, pose_matrix, transform
+    from plab.render.shapes import manipulator_parts, pose_matrix
 
     if poses is None:
         poses = np.array([[[*m.position, *m.rotation, m.gap] for m in scene.manipulators]])
     seen = [(sample_particles(scene) if x is None else x).reshape(-1, 3)]
     for number, manipulator in enumerate(scene.manipulators):
         for part in manipulator_parts(manipulator):
-            seen += [transform(pose_matrix(pose, part.side), part.mesh.points) for pose in poses[:, number]]
+            for matrix in (pose_matrix(pose, part.side) for pose in poses[:, number]):
+                seen.append(part.mesh.points @ matrix[:3, :3].T + matrix[:3, 3])
     if target_mass is not None:
         seen.append(np.argwhere(target_mass > TARGET_MASS) * scene.dx)
     points = np.concatenate(seen)

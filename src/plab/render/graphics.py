@@ -20,8 +20,7 @@ class RenderError(PlabError, RuntimeError):
 
 def require_graphics() -> None:
     """Raise :class:`RenderError` if a requirement of rendering is missing."""
-    reason = missing_graphics()
-    if reason:
+    if reason := missing_graphics():
         raise RenderError(reason)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from plab.config import Config, ConfigError
+from plab.config import ConfigError
 from plab.files import UNFINISHED, complete_folder
 from plab.progress import show_progress
 from plab.render.camera import scene_camera
@@ -23,7 +23,7 @@ from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
 from plab.render.rollouts import RecordedRollout, record, record_all, result
 from plab.results import ResultsError
-from plab.scenes import Camera, SceneError
+from plab.scenes import SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError
 
@@ -37,10 +37,7 @@ _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
 _SHEET_COLORS = 256
 _STRIP_FRAMES = 4  # of a task in the film strip
-_STRIP_COLUMNS = 2  # of tasks
-_STRIP_QUALITY = 88  # of JPEG
 _SET_EVERY = 2  # environment steps from one frame to the next, of a set
-
 
 _PAGE_SIZE = (480, 360)
 _RENDER_ERRORS = (
@@ -78,9 +75,9 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
     Raises:
         RenderError: If the file cannot be written.
     """
-    scene, target_mass, camera = recording.scene, recording.target_mass, _camera(recording, size)
-    with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path) as fresh:
-        _WRITERS[path.suffix.lower()](recording, renderer, every, fresh)
+    write = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}[path.suffix.lower()]
+    with _renderer(recording, size) as renderer, _writing(path) as fresh:
+        write(recording, renderer, every, fresh)
 
 
 def save_set(
@@ -100,24 +97,18 @@ def save_set(
     Raises:
         RenderError: If a file cannot be written.
     """
-    first = next(iter(recordings.values()))
-    x = np.concatenate([recording.x[[0, -1]] for recording in recordings.values()])
-    poses = np.concatenate([recording.poses[::5] for recording in recordings.values()])
-    camera = scene_camera(first.scene, first.target_mass, size, x, poses)
+    shown = [*recordings.values()]
     films = find_spec("imageio_ffmpeg") is not None
-    for name, recording in recordings.items():
-        scene, mass = recording.scene, recording.target_mass
-        with closing(Renderer(scene, mass, size, camera)) as renderer, _writing(folder / name):
-            if recording is first:
-                _save_webp(renderer.frame(first.x[0], first.poses[0]), folder / "start.webp")
-                _save_webp(renderer.target(first.poses[0]), folder / "target.webp")
-            _save_webp(renderer.frame(recording.x[-1], recording.poses[-1]), folder / f"{name}.webp")
+    for name, one in recordings.items():
+        with _renderer(one, size, shown) as renderer, _writing(folder / name):
+            pictures = {name: renderer.frame(one.x[-1], one.poses[-1])}
+            if one is shown[0]:
+                pictures["start"] = renderer.frame(one.x[0], one.poses[0])
+                pictures["target"] = renderer.target(one.poses[0])
+            for what, picture in pictures.items():
+                Image.fromarray(picture).save(folder / f"{what}.webp", quality=86)
             if films and name in filmed:
-                _save_mp4(recording, renderer, _SET_EVERY, folder / f"{name}.mp4")
-
-
-def _save_webp(picture: np.ndarray, path: Path) -> None:
-    Image.fromarray(picture).save(path, quality=86)
+                _save_mp4(one, renderer, _SET_EVERY, folder / f"{name}.mp4")
 
 
 def save_contact_sheet(
@@ -133,21 +124,14 @@ def save_contact_sheet(
     Raises:
         RenderError: If the file cannot be written.
     """
-    frame = size[0] // 2, size[1]
-    tiles = [
-        (_start_and_target(recording, frame), f"{recording.task}, variant {recording.variant}")
-        for recordings in rows.values()
-        for recording in recordings
-    ]
+    tiles = []
+    for one in (recording for recordings in rows.values() for recording in recordings):
+        with _renderer(one, (size[0] // 2, size[1])) as renderer:
+            pair = renderer.frame(one.x[0], one.poses[0]), renderer.target(one.poses[0])
+        tiles.append((np.concatenate(pair, axis=1), f"{one.task}, variant {one.variant}"))
     with _writing(path) as fresh:
         sheet = _tiled(tiles, max(map(len, rows.values())))
         _with_palette(sheet, _SHEET_COLORS).save(fresh, optimize=True)
-
-
-def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> np.ndarray:
-    with closing(Renderer(recording.scene, recording.target_mass, size)) as renderer:
-        start = renderer.frame(recording.x[0], recording.poses[0])
-        return np.concatenate([start, renderer.target(recording.poses[0])], axis=1)
 
 
 def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tuple[int, int]) -> None:
@@ -162,21 +146,26 @@ def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tup
         RenderError: If the file cannot be written.
     """
     tiles = []
-    for recording in recordings:
-        steps = np.linspace(0, len(recording.x) - 1, _STRIP_FRAMES).round().astype(int)
-        camera = _camera(recording, size)
-        with closing(Renderer(recording.scene, recording.target_mass, size, camera)) as renderer:
-            frames = [renderer.frame(recording.x[step], recording.poses[step]) for step in steps]
-        caption = f"{recording.task}, variant {recording.variant}: score {recording.score:.2f}"
+    for one in recordings:
+        steps = np.linspace(0, len(one.x) - 1, _STRIP_FRAMES).round().astype(int)
+        with _renderer(one, size) as renderer:
+            frames = [renderer.frame(one.x[step], one.poses[step]) for step in steps]
+        caption = f"{one.task}, variant {one.variant}: score {one.score:.2f}"
         tiles.append((np.concatenate(frames, axis=1), caption))
     with _writing(path) as fresh:
-        _tiled(tiles, _STRIP_COLUMNS).save(fresh, quality=_STRIP_QUALITY, optimize=True)
+        _tiled(tiles, 2).save(fresh, quality=88, optimize=True)
 
 
-def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
-    """Return a camera with a whole rollout in view."""
-    x, poses = recording.x[[0, -1]], recording.poses[::5]
-    return scene_camera(recording.scene, recording.target_mass, size, x, poses)
+@contextmanager
+def _renderer(
+    recording: RecordedRollout, size: tuple[int, int], seen: Sequence[RecordedRollout] = ()
+) -> Iterator[Renderer]:
+    """Open a renderer of a rollout, with it or others of the same configuration in view."""
+    scene, mass, seen = recording.scene, recording.target_mass, seen or [recording]
+    x = np.concatenate([one.x[[0, -1]].reshape(-1, 3) for one in seen])
+    poses = np.concatenate([one.poses[::5] for one in seen])
+    with closing(Renderer(scene, mass, size, scene_camera(scene, mass, size, x, poses))) as renderer:
+        yield renderer
 
 
 @contextmanager
@@ -198,7 +187,6 @@ def _writing(path: Path) -> Iterator[Path]:
 
 
 def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path: Path) -> None:
-    """Write start, target and end, side by side, with captions."""
     first, last, steps = recording.poses[0], recording.poses[-1], len(recording.x) - 1
     panels = [
         (renderer.frame(recording.x[0], first), f"{recording.task}, variant {recording.variant}: start"),
@@ -237,9 +225,6 @@ def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: 
         raise OSError("the film is incomplete: is the disk full?") from None
 
 
-_WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
-
-
 def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Iterator[np.ndarray]:
     last = len(recording.x) - 1
     for step in [*range(0, last, every), last]:
@@ -268,7 +253,7 @@ def _tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image
 
 
 def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
-    """Render runs of many configurations, see :func:`save_set`.
+    """Render runs of many configurations, see :func:`save_set`; those with films first.
 
     Args:
         wanted: For each configuration the folder of its pictures, which must not exist and appears when it is
@@ -285,23 +270,34 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
         # Leftover pictures of killed processes.
         for folder in place.glob(f"{UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
+    filmed = {folder: [n for n, (_, film) in files.items() if film] for folder, files in wanted.items()}
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
-        done = 0
-        for folders in _by_task(wanted).values():
+        for number, folder in enumerate(sorted(wanted, key=lambda one: -len(filmed[one])), start=1):
             try:
-                made = _replayed({folder: wanted[folder] for folder in folders})
+                made = _replayed({name: path for name, (path, _) in wanted[folder].items()})
             except _RENDER_ERRORS as error:
-                troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
+                troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue
-            for folder in folders:
-                with complete_folder(folder) as fresh:
-                    films = {name for name, (_, film) in wanted[folder].items() if film}
-                    save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _PAGE_SIZE, films)
-                done += 1
-                report(done, folder.name)
-                drawn()
+            with complete_folder(folder) as fresh:
+                save_set(made, fresh, _PAGE_SIZE, filmed[folder])
+            report(number, folder.name)
+            drawn()
     if troubles:
         raise RenderError("; ".join(troubles))
+
+
+def _replayed(files: Mapping[str, Path]) -> dict[str, RecordedRollout]:
+    """Replay runs of one configuration by name; runs with the same settings share a simulator."""
+    found = {name: result(path) for name, path in files.items()}
+    alike: dict[str, list[str]] = defaultdict(list)
+    for name, (cfg, actions) in found.items():
+        sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+        alike[json.dumps([*sections, actions.shape])].append(name)
+    made: dict[str, RecordedRollout] = {}
+    for names in alike.values():
+        cfgs, actions = zip(*(found[name] for name in names), strict=True)
+        made |= zip(names, record_all(cfgs, np.stack(actions)), strict=True)
+    return {name: made[name] for name in files}
 
 
 def draw_strip(path: Path, picture: Path) -> None:
@@ -319,29 +315,3 @@ def draw_strip(path: Path, picture: Path) -> None:
         save(record(*result(path)), picture, _PAGE_SIZE)
     except _RENDER_ERRORS as error:
         raise RenderError(str(error)) from error
-
-
-def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
-    """Return the folders by task, those with films first; configurations of one task share a compiled
-    simulator."""
-    groups: dict[str, list[Path]] = defaultdict(list)
-    for folder in sorted(wanted, key=lambda folder: -sum(film for _, film in wanted[folder].values())):
-        groups[folder.name.rpartition("-v")[0]].append(folder)
-    return groups
-
-
-def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
-    """Replay all runs of one task; runs with the same settings share a simulator."""
-    alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
-    for folder, files in group.items():
-        for name, (path, _) in files.items():
-            cfg, actions = result(path)
-            sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-            kind = json.dumps([*sections, actions.shape])
-            alike[kind].append(((folder, name), cfg, actions))
-    made: dict[tuple[Path, str], RecordedRollout] = {}
-    for cases in alike.values():
-        names = [name for name, _, _ in cases]
-        actions = np.stack([actions for _, _, actions in cases])
-        made |= zip(names, record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
-    return made

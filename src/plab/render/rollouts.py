@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -19,11 +19,9 @@ from plab.problem import Problem, build_scenes, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scenes import Scene
-from plab.sim import Simulator, State
+from plab.sim import Simulator
 from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
-
-Section = TypeVar("Section")
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class RecordedRollout:
         target_mass: Mass tensor of the target, shape [n, n, n]; None if it is not available.
         x: Particle positions [domain units] initially and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
-        scores: Scores of these states, shape [T + 1]; None without a target, or if not requested.
+        scores: Scores of these states, shape [T + 1]; None without a target.
         v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
         F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
@@ -78,15 +76,17 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
     try:
+        # Targets from user files are not in results.
+        kinds = {"task": TaskConfig, "protocol": ProtocolConfig, "sim": SimConfig, "targets": TargetsConfig}
+        sections: dict[str, Any] = {
+            name: OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), run.config[name]))
+            for name, kind in kinds.items()
+        }
         cfg = dataclasses.replace(
             _defaults(),
             variant=str(run.config["variant"]),
             seed_particles=run.config["seed_particles"],
-            task=_section(run.config["task"], TaskConfig),
-            protocol=_section(run.config["protocol"], ProtocolConfig),
-            sim=_section(run.config["sim"], SimConfig),
-            # Targets from user files are not in results.
-            targets=_section(run.config["targets"], TargetsConfig),
+            **sections,
         )
         components = build_scene(cfg).action_dim
     except (OmegaConfBaseException, LookupError, TypeError, ValueError) as error:
@@ -104,11 +104,6 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
 def _defaults() -> Config:
     """Return plab's default configuration, cached because composition takes a third of a second."""
     return load_config()
-
-
-def _section(values: dict[str, Any], kind: type[Section]) -> Section:
-    """Return a section of a configuration that was read from a file."""
-    return cast(Section, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), values)))
 
 
 def demonstration(cfg: Config) -> np.ndarray:
@@ -139,10 +134,10 @@ def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     return record_all([cfg], actions[None])[0]
 
 
-def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = True) -> list[RecordedRollout]:
-    """Simulate actions in [-1, 1], shape [batch, T, A], in configurations with one kind of scene; with
-    ``scored`` compute scores."""
-    return _recordings(cfgs, Problem(cfgs), actions, scored=scored)
+def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[RecordedRollout]:
+    """Simulate actions in [-1, 1], shape [batch, T, A], in configurations with one kind of scene."""
+    problem = Problem(cfgs)
+    return _recordings(cfgs, problem.scenes, problem.simulator, problem, actions)
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
@@ -151,73 +146,52 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     A target that cannot be generated, for example because its file is missing, is left out, with a message.
     """
     try:
-        (recording,) = _recordings([cfg], Problem([cfg]), actions[None], motion=True)
+        problem = Problem([cfg])
     except TargetError as error:
         print_once(f"without target and scores: {error}")
-    else:
-        if cfg.targets.source is not None:
-            print_once(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
-        return recording
-    scenes = build_scenes([cfg])
-    states = list(_states(make_simulator(cfg, scenes), actions[None]))
-    return RecordedRollout(
-        task=cfg.task.name,
-        variant=cfg.variant,
-        scene=scenes[0],
-        target_mass=None,
-        scores=None,
-        **_history(states, 0, motion=True),
-    )
+        scenes = build_scenes([cfg])
+        return _recordings([cfg], scenes, make_simulator(cfg, scenes), None, actions[None], motion=True)[0]
+    if cfg.targets.source is not None:
+        print_once(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
+    return _recordings([cfg], problem.scenes, problem.simulator, problem, actions[None], motion=True)[0]
 
 
 def starts(cfgs: Sequence[Config]) -> list[RecordedRollout]:
     """Return rollouts without steps, for configurations with one kind of scene."""
-    problem = Problem(cfgs)
-    return _recordings(cfgs, problem, np.zeros((len(cfgs), 0, problem.simulator.action_dim)))
-
-
-def _states(simulator: Simulator, actions: np.ndarray) -> Iterator[State]:
-    """Simulate actions, shape [batch, T, A]; yield the initial state and the state after each step."""
-    simulator.set_contact("hard")
-    simulator.reset()
-    yield simulator.state()
-    for step in range(actions.shape[1]):
-        simulator.step(actions[:, step])
-        yield simulator.state()
+    return record_all(cfgs, np.zeros((len(cfgs), 0, build_scene(cfgs[0]).action_dim)))
 
 
 def _recordings(
     cfgs: Sequence[Config],
-    problem: Problem,
+    scenes: Sequence[Scene],
+    simulator: Simulator,
+    problem: Problem | None,
     actions: np.ndarray,
     *,
     motion: bool = False,
-    scored: bool = True,
 ) -> list[RecordedRollout]:
-    """Return recordings of actions, shape [batch, T, A], in all environments of a problem."""
+    """Simulate actions, shape [batch, T, A], with targets and scores if there is a problem."""
+    names = ("x", "poses", *(("v", "F") if motion else ()))
     states, scores = [], []
-    for state in _states(problem.simulator, actions):
-        states.append(state)
-        if scored:
-            judged = problem.scores(problem.simulator.mass_tensor())
-            scores.append([one.score for one in judged])
+    simulator.set_contact("hard")
+    simulator.reset()
+    for step in range(actions.shape[1] + 1):
+        if step > 0:
+            simulator.step(actions[:, step - 1])
+        states.append(simulator.state())
+        if problem is not None:
+            scores.append([one.score for one in problem.scores(simulator.mass_tensor())])
     return [
         RecordedRollout(
             task=cfg.task.name,
             variant=cfg.variant,
-            scene=problem.scenes[number],
-            target_mass=problem.target_mass[number],
-            scores=np.array([score[number] for score in scores]) if scored else None,
-            **_history(states, number, motion=motion),
+            scene=scenes[number],
+            target_mass=None if problem is None else problem.target_mass[number],
+            scores=None if problem is None else np.array(scores)[:, number],
+            **{name: np.stack([getattr(state, name)[number] for state in states]) for name in names},
         )
         for number, cfg in enumerate(cfgs)
     ]
-
-
-def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str, np.ndarray]:
-    """Return the arrays of one environment of the batch for each state."""
-    names = ("x", "poses", *(("v", "F") if motion else ()))
-    return {name: np.stack([getattr(state, name)[number] for state in states]) for name in names}
 
 
 @functools.cache

@@ -1,18 +1,36 @@
-"""Meshes of manipulators, in their own frames and at their poses."""
+"""Meshes of manipulators, plasticine and targets.
+
+The surface of plasticine is a level set of the smoothed density of its particles that encloses the body's
+volume.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pyvista as pv
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from plab.scenes import Manipulator
+from plab.scenes import Body, Manipulator, Scene
+
+KERNEL_WIDTH = 1.5
+"""Standard deviation of the kernel that smooths particles [mean particle spacings]."""
+
+CELL = 0.9
+"""Grid spacing of the density [mean particle spacings]."""
+
+TARGET_BLUR = 0.85
+"""Standard deviation of the blur that smooths the random samples of a target [grid spacings of the scene]."""
 
 _AROUND, _ARC = 48, 32  # segments around an axis, and of a profile's circle
+_SMOOTHING = {"n_iter": 60, "pass_band": 0.02}  # of Taubin's filter
+_MARGIN = 6  # nodes around particles or a target, for the blur
+_NEARBY = 2.5  # width of the neighbourhood for the density of a target, in half nodes
+_TARGET_LEVEL = 0.7  # relative to this density; exact for flat surfaces
 
 
 @dataclass(frozen=True)
@@ -27,19 +45,9 @@ class Part:
     mesh: pv.PolyData
     side: float = 0.0
 
-    def scatter(self, area: float) -> np.ndarray:
-        """Return points distributed over the surface, one per given area, shape [point, 3]."""
-        triangles = self.mesh.triangulate()
-        sizes = triangles.compute_cell_sizes(length=False, volume=False)["Area"]
-        rng = np.random.default_rng(0)
-        drawn = rng.choice(len(sizes), math.ceil(sizes.sum() / area), p=sizes / sizes.sum())
-        corners = triangles.points[triangles.regular_faces[drawn]]
-        return np.einsum("ij,ijk->ik", rng.dirichlet(np.ones(3), len(drawn)), corners)
-
 
 def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     """Return the parts of a manipulator."""
-
     meshes: dict[str, Callable[..., pv.PolyData]] = {
         "Box": lambda x, y, z: pv.Box((-x, x, -y, y, -z, z)),
         "Sphere": lambda radius: pv.Sphere(radius=radius, theta_resolution=_AROUND, phi_resolution=_ARC),
@@ -81,6 +89,48 @@ def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:
     return matrix
 
 
-def transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Apply a homogeneous matrix, shape [4, 4], to points, shape [..., 3]."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
+def body_meshes(scene: Scene, x: np.ndarray) -> Iterator[pv.PolyData]:
+    """Yield the surface of each body with particles at positions [domain units], shape [particle, 3]."""
+    for number, body in enumerate(scene.bodies):
+        yield body_mesh(body, x[scene.particle_bodies == number])
+
+
+def body_mesh(body: Body, x: np.ndarray) -> pv.PolyData:
+    """Return the surface of a body with particles at positions [domain units], shape [particle, 3]."""
+    cell = CELL * (body.volume / body.particles) ** (1 / 3)
+    low = np.floor(x.min(axis=0) / cell) - _MARGIN
+    node = np.round(x / cell - low).astype(np.int64)
+    shape = tuple(node.max(axis=0) + _MARGIN + 1)
+    count = np.bincount(np.ravel_multi_index(node.T, shape), minlength=math.prod(shape))
+    density = gaussian_filter(count.reshape(shape).astype(np.float32), KERNEL_WIDTH / CELL, mode="constant")
+    nodes = round(body.volume / cell**3)
+    level = float(np.partition(density, -nodes, axis=None)[-nodes])
+    return _level_set(density, level, low * cell, cell)
+
+
+def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
+    """Return the surface of a target with a mass tensor, shape [n, n, n]; node i is at i / n.
+
+    The level is a fraction of the local density, because bodies may differ in density.
+    """
+    occupied = np.argwhere(mass > 0)
+    low, high = occupied.min(axis=0), occupied.max(axis=0) + 1
+    part = np.pad(mass[tuple(map(slice, low, high))], _MARGIN)
+    # Twice as fine; the blur fills the intermediate nodes.
+    fine = np.zeros(2 * np.array(part.shape) - 1, np.float32)
+    fine[::2, ::2, ::2] = part / part.max()
+    fine = gaussian_filter(fine, 2 * TARGET_BLUR, mode="constant")
+    weight = gaussian_filter(fine, _NEARBY, mode="constant")
+    nearby = gaussian_filter(fine * fine, _NEARBY, mode="constant") / np.maximum(weight, 1e-6)
+    values = fine / np.maximum(nearby, 1e-3)
+    return _level_set(values, _TARGET_LEVEL, (low - _MARGIN) * scene.dx, 0.5 * scene.dx)
+
+
+def _level_set(values: np.ndarray, level: float, origin: np.ndarray, spacing: float) -> pv.PolyData:
+    image = pv.ImageData(dimensions=values.shape, spacing=(spacing,) * 3, origin=origin)
+    image["density"] = values.ravel(order="F")
+    mesh = image.contour(
+        [level], "density", method="flying_edges", compute_normals=False, compute_scalars=False
+    )
+    mesh = mesh.smooth_taubin(**_SMOOTHING)
+    return mesh.compute_normals(split_vertices=False, consistent_normals=False, auto_orient_normals=False)

@@ -16,18 +16,9 @@ import pyvista as pv
 from jinja2 import Environment, StrictUndefined, Template
 
 from plab.render.camera import scene_camera
-from plab.render.renderer import (
-    BODY_COLORS,
-    INK,
-    MANIPULATOR_COLOR,
-    PAPER,
-    TARGET_COLOR,
-    surface_mesh,
-    target_mesh,
-)
+from plab.render.renderer import BODY_COLORS, INK, MANIPULATOR_COLOR, PAPER, TARGET_COLOR
 from plab.render.rollouts import RecordedRollout
-from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.render.surface import body_slices, body_surfaces
+from plab.render.shapes import body_mesh, manipulator_parts, pose_matrix, target_mesh
 
 _FRAMES = 60
 _POSITIONS = 600_000  # particles in all frames together: about 6 MB of the page
@@ -61,13 +52,8 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
     last = len(recording.x) - 1
     every = every or max(1, -(-last // _FRAMES))
     steps = sorted({*range(0, last, every), last})
-    camera = scene_camera(
-        recording.scene,
-        recording.target_mass,
-        (round(300 * _ASPECT), 300),
-        recording.x[[0, -1]],
-        recording.poses[::5],
-    )
+    scene, mass, x = recording.scene, recording.target_mass, recording.x[[0, -1]]
+    camera = scene_camera(scene, mass, (round(300 * _ASPECT), 300), x, recording.poses[::5])
     plot = k3d.plot(
         antialias=2,
         background_color=_number(PAPER),
@@ -79,16 +65,38 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         axes_helper=0,
         menu_visibility=False,
     )
-    bodies = (_surfaces if surface else _particles)(recording, steps)
-    things = [*bodies, *_manipulators(recording, steps), *_target_mesh(recording), _floor()]
+    bodies = _plasticine(recording, steps, surface=surface)
+    things = [*bodies, *_manipulators(recording, steps), *_target(recording), _floor()]
     for number, thing in enumerate(things, start=1):
         # Independent of memory addresses, so that the same rollout gives the same page.
         thing.id = number
         plot += thing
+    groups = {thing.group for thing in things}
+    scores = recording.scores
+    content = {
+        "steps": last,
+        "speed": _STEPS_PER_SECOND,
+        "scores": None if scores is None else [round(float(score), 3) for score in scores],
+        # The page sets the camera according to the width of its window.
+        "camera": [round(float(v), 4) for v in (*camera.position, *camera.target, 0.0, 1.0, 0.0)],
+        "aspect": _ASPECT,
+        "interpolate": not surface,
+    }
+    title = f"{recording.task}, variant {recording.variant}"
+    bar = _template("bar.html").render(
+        title=title,
+        # The only character that could end the enclosing script.
+        content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
+        faded=[group for group in ("plasticine", "manipulators", "target") if group in groups],
+    )
+    head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
     snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
-    # The page sets the camera according to the width of its window.
-    seen = [*camera.position, *camera.target, 0.0, 1.0, 0.0]
-    return _with_bar(snapshot, recording, seen, {thing.group for thing in things}, interpolate=not surface)
+    snapshot = re.sub("<title>.*?</title>", lambda _: head, snapshot, count=1)
+    snapshot = snapshot.replace("<body>", f"<body>\n{bar}", 1)
+    # Licences of K3D-jupyter and its dependencies, which must be included.
+    found = sorted(path for path in installed_files("k3d") or [] if path.name in _LICENCES)
+    licences = "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in found)
+    return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)
 
 
 def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
@@ -96,46 +104,31 @@ def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
     return _template("gallery.html").render(pages=pages)
 
 
-def _particles(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
-    """Yield the particles of each body."""
+def _plasticine(recording: RecordedRollout, steps: Sequence[int], *, surface: bool) -> Iterator[Any]:
+    """Yield each body, as particles or as a surface."""
     scene = recording.scene
     stride = -(-len(steps) * scene.particle_count // _POSITIONS)
-    for number, (body, at) in enumerate(zip(scene.bodies, body_slices(scene), strict=True)):
-        spacing = (stride * body.volume / body.particles) ** (1 / 3)
-        x = np.round(recording.x[steps, at][:, ::stride] * _LEVELS) / _LEVELS
-        yield k3d.points(
-            {str(step): frame for step, frame in zip(steps, x.astype(np.float32), strict=True)},
-            color=_number(BODY_COLORS[number % len(BODY_COLORS)]),
-            point_size=_OVERLAP * spacing,
-            roughness=0.9,
-            group="plasticine",
-        )
-
-
-def _surfaces(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
-    """Yield the surface of each body."""
-    scene = recording.scene
     largest = _VERTICES / (len(steps) * len(scene.bodies))
-    for number, (surface, at) in enumerate(zip(body_surfaces(scene), body_slices(scene), strict=True)):
-        vertices, triangles = {}, {}
+    for number, body in enumerate(scene.bodies):
+        color = _number(BODY_COLORS[number % len(BODY_COLORS)])
+        look = {"color": color, "roughness": 0.9, "group": "plasticine"}
+        own = recording.x[:, scene.particle_bodies == number]
+        points, triangles = {}, {}
         for step in steps:
-            mesh = surface_mesh(surface.field(recording.x[step, at]))
-            if mesh.n_points > largest:
-                mesh = mesh.decimate(1.0 - largest / mesh.n_points)
-            vertices[str(step)] = (np.round(np.asarray(mesh.points) * _LEVELS) / _LEVELS).astype(np.float32)
-            triangles[str(step)] = mesh.regular_faces.astype(np.uint32)
-        yield k3d.mesh(
-            vertices,
-            triangles,
-            color=_number(BODY_COLORS[number % len(BODY_COLORS)]),
-            flat_shading=False,
-            roughness=0.9,
-            group="plasticine",
-        )
+            x = own[step, ::stride]
+            if surface:
+                mesh = body_mesh(body, own[step])
+                mesh = mesh.decimate(1.0 - largest / mesh.n_points) if mesh.n_points > largest else mesh
+                x, triangles[str(step)] = mesh.points, mesh.regular_faces.astype(np.uint32)
+            points[str(step)] = (np.round(x * _LEVELS) / _LEVELS).astype(np.float32)
+        if surface:
+            yield k3d.mesh(points, triangles, flat_shading=False, **look)
+        else:
+            spacing = (stride * body.volume / body.particles) ** (1 / 3)
+            yield k3d.points(points, point_size=_OVERLAP * spacing, **look)
 
 
 def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
-    """Yield the parts of the manipulators."""
     for number, manipulator in enumerate(recording.scene.manipulators):
         for part in manipulator_parts(manipulator):
             poses = recording.poses[steps, number]
@@ -145,8 +138,7 @@ def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[
             yield mesh
 
 
-def _target_mesh(recording: RecordedRollout) -> Iterator[Any]:
-    """Yield the target, if there is one."""
+def _target(recording: RecordedRollout) -> Iterator[Any]:
     if recording.target_mass is not None:
         mesh = _mesh(target_mesh(recording.scene, recording.target_mass), TARGET_COLOR, "target")
         mesh.opacity = _GHOST_OPACITY
@@ -179,40 +171,6 @@ def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
         roughness=0.6,
         group=group,
     )
-
-
-def _with_bar(
-    snapshot: str,
-    recording: RecordedRollout,
-    camera: Sequence[float],
-    groups: set[str],
-    *,
-    interpolate: bool,
-) -> str:
-    """Return K3D-jupyter's page with a title, the bar, and licences."""
-    scores = recording.scores
-    content = {
-        "steps": len(recording.x) - 1,
-        "speed": _STEPS_PER_SECOND,
-        "scores": None if scores is None else [round(float(score), 3) for score in scores],
-        "camera": [round(float(number), 4) for number in camera],
-        "aspect": _ASPECT,
-        "interpolate": interpolate,
-    }
-    title = f"{recording.task}, variant {recording.variant}"
-    bar = _template("bar.html").render(
-        title=title,
-        # The only character that could end the enclosing script.
-        content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
-        faded=[group for group in ("plasticine", "manipulators", "target") if group in groups],
-    )
-    head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
-    snapshot = re.sub("<title>.*?</title>", lambda _: head, snapshot, count=1)
-    snapshot = snapshot.replace("<body>", f"<body>\n{bar}", 1)
-    # Licences of K3D-jupyter and its dependencies, which must be included.
-    found = sorted(path for path in installed_files("k3d") or [] if path.name in _LICENCES)
-    licences = "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in found)
-    return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)
 
 
 def _template(name: str) -> Template:
