@@ -34,16 +34,17 @@ def answered(reading: Callable[[], Any]) -> None:
 
 
 def made(folder: Path, *, packed: bool) -> Path:
-    """Write a stopped run with a mass tensor and a state to go on from, or an archive of it and another."""
+    """Write a stopped run with a mass tensor and a state, or an archive of two finished ones."""
     run = synthetic.run(folder / "runs")
     run.masses = {"final": np.pad(np.full((2, 2, 2), 0.5), 31)}
     run.status, run.message, run.evaluation = "stopped", "interrupted", {}
     run.resume = {"actions": run.best_actions / 2, "optimizer": {"step": np.float32(3)}}
     path = synthetic.save(run)
     if packed:
-        synthetic.save(synthetic.run(folder / "runs", seed=1))
+        for seed in (1, 2):
+            synthetic.save(synthetic.run(folder / "runs", seed=seed))
         path = folder / "all.plab.zip.xz"
-        pack(folder / "runs", path, wanted=lambda _: True)
+        pack(folder / "runs", path)
     return path
 
 

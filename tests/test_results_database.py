@@ -169,10 +169,11 @@ def test_tables(folder: Path) -> None:
         assert (folder / table["path"][0]) == Path(path)
         assert table["protocol"].tolist() == ["plab"] and table["targets"].isna().all()
         of_run = f"WHERE run = {number}"
-        evaluation = dict(connection.execute(f"SELECT name, value FROM evaluations {of_run}").fetchall())
-        assert evaluation == run.evaluation
-        times = dict(connection.execute(f"SELECT phase, seconds FROM times {of_run}").fetchall())
-        assert times == run.wall_time
+        for name, value in run.evaluation.items():
+            assert table["score_best" if name == "score" else name].tolist() == [value], name
+        assert {f"seconds_{name}": [value] for name, value in run.wall_time.items()}.items() <= (
+            table.to_dict("list").items()
+        )
         settings = dict(connection.execute(f"SELECT key, value FROM config {of_run}").fetchall())
         assert float(settings["method.lr"]) == run.config["method"]["lr"]
         center = run.config["task"]["bodies"]["rope"]["center"]
@@ -196,7 +197,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
     # Loose files that are as good as each other all stay; what an archive has beside them does not.
     assert ask(sources, listed) == [*of_one, *((str(two), seed, 0.5, None) for seed in (1, 2))]
     assert len(load(sources)) == 4
-    for name in ("evaluations", "times", "config", "iterations"):
+    for name in ("config", "iterations"):
         values = f"SELECT {name}.* FROM runs JOIN {name} USING (run) WHERE folder = '{two}'"
         together, alone = (sorted(row[1:] for row in ask(places, values)) for places in (sources, two))
         assert together and together == alone, name
@@ -206,7 +207,7 @@ def test_sql_refuses_in_a_line(folder: Path, told) -> None:
     load(folder)
     for sql, named in (
         ("select lr from runs", "lr"),
-        ("select * from scores", "evaluations"),
+        ("select * from scores", "iterations"),
     ):
         assert named in told(["sql", sql, str(folder)], main)
 

@@ -24,12 +24,12 @@ from plab.cli.command import (
     sources_and_words,
 )
 from plab.cli.tables import print_table
-from plab.config.selection import Selection, require_possible, select
-from plab.errors import ArgumentError, tell
+from plab.config.selection import require_possible, select
+from plab.errors import tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.query import query, scores
-from plab.results.schema import STATUSES, ResultsError
+from plab.results.schema import ResultsError
 from plab.results.table import rows
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")
@@ -61,14 +61,16 @@ def _scores(argv: Sequence[str]) -> None:
     add_forms(parser)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
-    chosen = _finished_by_default(select(words, SELECTABLE))
+    chosen = select(words, SELECTABLE)
+    if chosen.choices.setdefault("status", ["finished"]) == ["all"]:
+        del chosen.choices["status"]
     table, unreadable = scores(sources, chosen, options.keys, options.sort, descending=options.descending)
     _report_skipped(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
 
 
 def _sql(argv: Sequence[str]) -> None:
-    """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
+    """Answer an SQL query about the tables runs, config and iterations."""
     parser = Parser("plab results sql", _sql.__doc__)
     parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
     add_sources(parser)
@@ -97,30 +99,21 @@ def _check(argv: Sequence[str]) -> int:
 
 
 def _pack(argv: Sequence[str]) -> None:
-    """Pack runs into an archive."""
+    """Pack finished runs into an archive."""
     parser = Parser("plab results pack", _pack.__doc__)
-    add_sources(parser, "runs to take: task=Rope,Move status=all (default: finished)")
+    add_sources(parser, "runs to take: task=Rope,Move")
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
-    parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
     what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
     parser.add_argument("--digits", type=positive, help=what)
-    parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
     chosen = select(words, SELECTABLE)
-    for text in chosen.choices.get("status", ()):
-        if text not in (*STATUSES, "all"):
-            raise ArgumentError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
     if words:
-        others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
-        require_possible(Selection(others, chosen.keys), rows(sources)[0])
-    chosen = _finished_by_default(chosen)
+        require_possible(chosen, rows(sources)[0])
     done = pack(
         sources,
         options.output,
         wanted=lambda row: chosen(row.values, row.config),
-        keep_masses=options.masses,
-        keep_resume=options.resume,
         digits=options.digits,
     )
     _report_skipped(done.unreadable)
@@ -149,10 +142,3 @@ def _names(text: str) -> list[str]:
 def _report_skipped(unreadable: Iterable[ResultsError]) -> None:
     for error in unreadable:
         tell(f"left out: {error}")
-
-
-def _finished_by_default(chosen: Selection) -> Selection:
-    statuses = chosen.choices.setdefault("status", ["finished"])
-    if statuses == ["all"]:
-        del chosen.choices["status"]
-    return chosen

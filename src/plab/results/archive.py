@@ -20,7 +20,7 @@ import numpy as np
 
 from plab.config.run import member_name
 from plab.results.run_file import encode, read, replace_file
-from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult
+from plab.results.schema import ARCHIVE_SUFFIX, ResultsError, RunResult
 from plab.results.table import Row, rows
 
 
@@ -45,12 +45,11 @@ def pack(
     source: str | Path | Sequence[str | Path],
     archive: str | Path,
     *,
-    wanted: Callable[[Row], bool] | None = None,
-    keep_masses: bool = False,
-    keep_resume: bool = False,
+    wanted: Callable[[Row], bool] = lambda row: True,
     digits: int | None = None,
 ) -> ArchiveSummary:
-    """Write runs into an archive, in one atomic step.
+    """Write finished runs into an archive, in one atomic step, without mass tensors, which can be recomputed
+    from the best actions.
 
     Runs in archives below ``source`` are included; packing again therefore adds new runs, also if the archive
     itself is there. ``results_dir`` becomes ``results``.
@@ -58,9 +57,7 @@ def pack(
     Args:
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
-        wanted: Predicate of the runs to include; default: all finished ones.
-        keep_masses: Include mass tensors, which can be recomputed from the best actions.
-        keep_resume: Include the state for resuming unfinished runs.
+        wanted: Predicate of the runs to include.
         digits: Least number of significant digits of the iterations, >= 1; None: all. four reduce the size by
             two thirds. Actions and the final evaluation keep all digits.
 
@@ -73,33 +70,21 @@ def pack(
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = rows(source)
     chosen: dict[str, Row] = {}
-    for row in filter(wanted or _finished, found):
-        name = _member(row).as_posix()
-        if name in chosen:
-            raise ResultsError(
-                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
-            )
-        chosen[name] = row
+    for row in found:
+        if row.values["status"] == "finished" and wanted(row):
+            name = member_name(row.config, row.values["config_hash"]).as_posix()
+            if (other := chosen.setdefault(name, row)) is not row:
+                raise ResultsError(f"{row.path} and {other.path} are runs of one configuration: remove one")
     if not chosen:
         raise ResultsError(
             "there is nothing to pack: no run fits" + (f"; {unreadable[0]}" if unreadable else "")
         )
     members = []
     for name, row in sorted(chosen.items()):
-        try:
-            run = read(row.path)
-        except ResultsError as error:
-            # Of its mass tensors or its state: rows are read without them.
-            unreadable.append(error)
-            continue
-        run = replace(
-            run if digits is None else _rounded(run, digits),
-            # Paths are meaningless on other computers.
-            config=run.config | {"results_dir": "results"},
-            masses=run.masses if keep_masses else {},
-            resume=run.resume if keep_resume else None,
-        )
-        members.append((name, encode(run, compress=False)))
+        run = read(row.path)
+        # Paths are meaningless on other computers.
+        run = replace(run, config=run.config | {"results_dir": "results"}, masses={})
+        members.append((name, encode(run if digits is None else _rounded(run, digits), compress=False)))
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
     replace_file(archive, content, sync=True)
@@ -151,7 +136,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
         raise unreadable[0]
     written = 0
     for row in found:
-        path = Path(folder) / _member(row)
+        path = Path(folder) / member_name(row.config, row.values["config_hash"])
         if not path.resolve().is_relative_to(Path(folder).resolve()):
             raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
         if path.exists():
@@ -159,13 +144,3 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
         replace_file(path, encode(read(row.path), compress=True))
         written += 1
     return written, len(found) - written
-
-
-def _member(row: Row) -> Path:
-    """Return a run's path in an archive, or in a folder of results."""
-    name = member_name(row.config, row.values["config_hash"])
-    return name if _finished(row) else name.with_suffix(PARTIAL_SUFFIX)
-
-
-def _finished(row: Row) -> bool:
-    return row.values["status"] == "finished"

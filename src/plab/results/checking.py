@@ -68,87 +68,83 @@ def _checked(file: h5py.File, place: Path) -> tuple[Path, Fault | None]:
 
 def faults(run: RunResult) -> list[str]:
     """Return the faults of a readable run."""
-    found = [*_status(run), *_iterations(run), *_best(run)]
+    found = [*_identity(run), *_iterations(run), *_best(run)]
     if run.status == "finished":
         found += [*_evaluation(run), *_complete(run)]
-    return list(dict.fromkeys(found))
+    return [reason for is_fault, reason in found if is_fault]
 
 
-def _status(run: RunResult) -> Iterator[str]:
-    if run.status not in STATUSES:
-        yield f"status {run.status!r:.80} is none of {', '.join(STATUSES)}"
-        return
+Finding = tuple[bool, str]
+"""Whether there is a fault, and its reason."""
+
+
+def _identity(run: RunResult) -> Iterator[Finding]:
+    yield run.status not in STATUSES, f"status {run.status!r:.80} is none of {', '.join(STATUSES)}"
     partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
-    if partial == (run.status == "finished"):
-        yield f"the name says that the run is {'not ' if partial else ''}finished, the status is {run.status}"
-    if config_hash(run.config) != run.config_hash:
-        yield "config_hash is not that of config"
+    yield partial == (run.status == "finished"), f"the name does not fit the status {run.status}"
+    yield config_hash(run.config) != run.config_hash, "config_hash is not that of config"
 
 
-def _iterations(run: RunResult) -> Iterator[str]:
-    table = run.iterations
-    if table.empty:
+def _iterations(run: RunResult) -> Iterator[Finding]:
+    table = run.columns
+    if not run.rows:
         return
     family, common = known_family(run.config["method"]["family"]), (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
     # Additional columns of external families are not checked.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
-    # Files of earlier versions may lack optional entries.
     if missing := [name for name in wanted if name not in table and name not in may_be_nan]:
-        yield f"iterations lack {', '.join(missing)}"
+        yield True, f"iterations lack {', '.join(missing)}"
         return
-    if endless := [name for name in table if name not in may_be_nan and not np.isfinite(table[name]).all()]:
-        yield f"iterations are not finite: {', '.join(endless)}"
-    if not np.array_equal(table["iteration"], np.arange(len(table))):
-        yield "iterations are not numbered 0, 1, 2, ..."
-    if falling := [name for name in ("episodes", "steps", *BUDGETS) if (np.diff(table[name]) < 0).any()]:
-        yield f"{', '.join(falling)} decrease"
-    if outside := [name for name in ("iou", "score") if not table[name].between(0.0, 1.0).all()]:
-        yield f"{', '.join(outside)} leaves [0, 1]"
+    endless = [name for name in table if name not in may_be_nan and not np.isfinite(table[name]).all()]
+    falling = [name for name in ("episodes", "steps", *BUDGETS) if (np.diff(table[name]) < 0).any()]
+    outside = [name for name in ("iou", "score") if not ((table[name] >= 0) & (table[name] <= 1)).all()]
+    yield bool(endless), f"iterations are not finite: {', '.join(endless)}"
+    yield bool(falling), f"{', '.join(falling)} decrease"
+    yield bool(outside), f"{', '.join(outside)} leaves [0, 1]"
+    numbered = np.array_equal(table["iteration"], np.arange(run.rows))
+    yield not numbered, "iterations are not numbered 0, 1, 2, ..."
 
 
-def _best(run: RunResult) -> Iterator[str]:
-    actions, table, horizon = run.best_actions, run.iterations, run.config["sim"]["horizon"]
+def _best(run: RunResult) -> Iterator[Finding]:
+    actions, horizon = run.best_actions, run.config["sim"]["horizon"]
     if actions is None:
-        if not table.empty:
-            yield "it has iterations, but no best actions"
+        yield run.rows > 0, "it has iterations, but no best actions"
         return
-    if actions.ndim != 2 or len(actions) != horizon:
-        yield f"best actions have shape {list(actions.shape)}, not [{horizon}, A]"
-    if not (np.abs(actions) <= 1.0).all():
-        yield "best actions leave [-1, 1]"
-    if not 0 <= run.best_iteration < len(table):
-        yield f"there is no iteration {run.best_iteration}, which is to be the best"
-    elif run.best_loss != (loss := table["loss"][run.best_iteration]):
-        yield f"the best loss is {run.best_loss:g}, that of its iteration {loss:g}"
+    shape = list(actions.shape)
+    yield actions.ndim != 2 or len(actions) != horizon, f"best actions have shape {shape}, not [{horizon}, A]"
+    yield not (np.abs(actions) <= 1.0).all(), "best actions leave [-1, 1]"
+    if 0 <= run.best_iteration < run.rows:
+        loss = run.columns["loss"][run.best_iteration]
+        yield run.best_loss != loss, f"the best loss is {run.best_loss:g}, that of its iteration {loss:g}"
+    else:
+        yield True, f"there is no iteration {run.best_iteration}, which is to be the best"
 
 
-def _evaluation(run: RunResult) -> Iterator[str]:
+def _evaluation(run: RunResult) -> Iterator[Finding]:
     values, size = run.evaluation, run.config["sim"]["grid_size"]
     for name, mass in run.masses.items():
-        if mass.shape != (size,) * 3 or not np.isfinite(mass).all():
-            yield f"mass {name} has shape {list(mass.shape)}, not {[size] * 3}, or is not finite somewhere"
-    if missing := [name for name in (*EVALUATION, *loss_columns(run.config)) if name not in values]:
-        yield f"evaluation lacks {', '.join(missing)}"
-        return
-    if endless := [name for name, value in values.items() if not np.isfinite(value)]:
-        yield f"evaluation is not finite: {', '.join(endless)}"
-        return
-    if outside := [name for name in _IN_UNIT_INTERVAL if not 0.0 <= values[name] <= 1.0]:
-        yield f"evaluation leaves [0, 1]: {', '.join(outside)}"
-    again = scores_from_iou(values["iou_initial"], values["iou"], values["iou_target_self"])
-    for name in ("score", "score_printed"):
-        if not np.isclose(values[name], getattr(again, name), rtol=_TOLERANCE, atol=_TOLERANCE):
-            yield f"{name} is {values[name]:g}, by the IoUs it should be {getattr(again, name):g}"
+        wrong = mass.shape != (size,) * 3 or not np.isfinite(mass).all()
+        yield wrong, f"mass {name} has shape {list(mass.shape)}, not {[size] * 3}, or is not finite somewhere"
+    missing = [name for name in (*EVALUATION, *loss_columns(run.config)) if name not in values]
+    endless = [name for name, value in values.items() if not np.isfinite(value)]
+    outside = [name for name in _IN_UNIT_INTERVAL if not 0.0 <= values.get(name, 0.0) <= 1.0]
+    yield bool(missing), f"evaluation lacks {', '.join(missing)}"
+    yield bool(endless), f"evaluation is not finite: {', '.join(endless)}"
+    yield bool(outside), f"evaluation leaves [0, 1]: {', '.join(outside)}"
+    if not (missing or endless or outside):
+        again = scores_from_iou(values["iou_initial"], values["iou"], values["iou_target_self"])
+        for name in ("score", "score_printed"):
+            same = np.isclose(values[name], getattr(again, name), rtol=_TOLERANCE, atol=_TOLERANCE)
+            yield not same, f"{name} is {values[name]:g}, by the IoUs it should be {getattr(again, name):g}"
 
 
-def _complete(run: RunResult) -> Iterator[str]:
-    method, table = run.config["method"], run.iterations
+def _complete(run: RunResult) -> Iterator[Finding]:
+    method, table = run.config["method"], run.columns
     wanted, own = row_count(method), known_family(method["family"])
-    by_score = own is not None and own.ranking == "score" and "score" in table
+    by_score = own is not None and own.ranking == "score" and run.rows > 0
     solved = by_score and table["score"].max() >= SOLVED
-    if wanted is not None and len(table) != wanted and not (solved and len(table) < wanted):
-        yield f"it is finished after {len(table)} of {wanted} iterations"
-    done = int(table["episodes"].iloc[-1]) if len(table) else 0
-    if done < method.get("episodes", 0):
-        yield f"it is finished after {done} of {method['episodes']} episodes"
+    short = wanted is not None and run.rows != wanted and not (solved and run.rows < wanted)
+    yield short, f"it is finished after {run.rows} of {wanted} iterations"
+    done, episodes = int(table["episodes"][-1]) if run.rows else 0, method.get("episodes", 0)
+    yield done < episodes, f"it is finished after {done} of {episodes} episodes"

@@ -112,21 +112,10 @@ _NAMES = ("task", "variant", "method", "seed")
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
 """Columns by configuration key that must agree within a mean."""
 
-_TABLES = {
-    "runs": ["run", *COLUMNS, "score_best", "protocol", "targets", "folder"],
-    "config": ["run", "key", "value", "number"],
-    "evaluations": ["run", "name", "value"],
-    "times": ["run", "phase", "seconds"],
-    "iterations": ["run"],
-}
-"""Tables and their columns; ``iterations`` has those of the runs, too."""
+_TABLES = ("runs", "config", "iterations")
 
-_TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets")
-_NUMBERS = ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best")
-"""Columns of ``runs`` with fixed types."""
-
-_NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
-"""Columns of a table of runs other than scalars of the final evaluation."""
+_TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets", "folder")
+"""Columns of ``runs`` that are texts, also if all are missing."""
 
 
 def _connected(
@@ -135,40 +124,30 @@ def _connected(
     import duckdb
 
     found, unreadable = rows(sources)
-    tables = _tables(found, sources)
-    if iterations:
-        curves = read_curves(row.path for row in found)
-        frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
-        tables["iterations"] = pd.concat(frames or [tables["times"][["run"]]])
-    connection = duckdb.connect()
-    for name, table in tables.items():
-        connection.register("frame", table)
-        connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
-        connection.unregister("frame")
-    return connection, unreadable
-
-
-def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
-    """Return all tables except ``iterations``."""
-    lines: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
+    runs, config = [], []
     for run, row in enumerate(found):
-        values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
-        values["folder"] = next(str(one) for one in sources if row.path.is_relative_to(one))
-        lines["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
+        more = {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
+        folder = next(str(one) for one in sources if row.path.is_relative_to(one))
+        runs.append({"run": run} | row.values | more | {"folder": folder})
         for key, value in leaves(row.config):
             number = float(value) if isinstance(value, int | float) else None
             plain = value is None or isinstance(value, str)
-            lines["config"].append((run, key, value if plain else json.dumps(value), number))
-        for name, value in row.values.items():
-            if name.startswith("seconds_"):
-                lines["times"].append((run, name.removeprefix("seconds_"), value))
-            elif value == value and name not in _NO_EVALUATION:
-                lines["evaluations"].append((run, "score" if name == "score_best" else name, value))
-    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in lines.items()}
-    types = dict.fromkeys(_TEXTS, "string") | dict.fromkeys(_NUMBERS, "float64")
-    tables["runs"] = tables["runs"].astype(types)
-    tables["config"] = tables["config"].astype({"number": "float64"})
-    return tables
+            config.append((run, key, value if plain else json.dumps(value), number))
+    table = pd.DataFrame(runs, columns=None if runs else ["run", *COLUMNS, *_SETTINGS, "folder"])
+    tables = {
+        "runs": table.astype(dict.fromkeys(_TEXTS, "string")),
+        "config": pd.DataFrame(config, columns=["run", "key", "value", "number"]).astype({"number": float}),
+    }
+    if iterations:
+        curves = read_curves(row.path for row in found)
+        frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
+        tables["iterations"] = pd.concat(frames or [table[["run"]]])
+    connection = duckdb.connect()
+    for name, frame in tables.items():
+        connection.register("frame", frame)
+        connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
+        connection.unregister("frame")
+    return connection, unreadable
 
 
 def _value(row: Row, name: str) -> Any:

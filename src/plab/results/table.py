@@ -12,7 +12,7 @@ import os
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ from plab.files import cache_dir
 from plab.results.examples import resolve
 from plab.results.run_file import (
     actions_of,
-    curves_of,
+    columns_of,
     opened,
     opened_archive,
     opened_member,
@@ -41,10 +41,10 @@ from plab.results.schema import (
     SCHEMA_VERSION,
     ResultsError,
     last_score,
-    row_count,
     scores_last_iteration,
     stored_config,
 )
+from plab.results.schema import COLUMNS as ITERATION_COLUMNS
 
 T = TypeVar("T")
 
@@ -85,9 +85,9 @@ class Row:
         return Path(self.values["path"])
 
 
-Index = dict[str, tuple[str, list[tuple[str, str, str]]]]
-"""By path below the folder: identity of the file, and for each of its runs the name in an archive (empty for
-single files) and the two parts of :class:`Row` as JSON."""
+Index = dict[str, tuple[str, str]]
+"""By path below the folder: identity of the file, and JSON of its runs: for each the name in an archive ("."
+for a file) and the two parts of :class:`Row`."""
 
 
 def load(
@@ -172,13 +172,13 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
     found: dict[str, dict[str, np.ndarray]] = {}
     for archive in archives:
         # An archive is unpacked once for all of its runs.
-        for entry in read_each(archive, lambda file, place: (str(place), curves_of(file)), {*wanted}):
+        for entry in read_each(archive, lambda file, place: (str(place), columns_of(file)), {*wanted}):
             if isinstance(entry, ResultsError):
                 raise entry
             found[entry[0]] = entry[1]
     for path in {*wanted} - found.keys():
         with opened(Path(path)) as file:
-            found[path] = curves_of(file)
+            found[path] = columns_of(file)
     return [found[path] for path in wanted]
 
 
@@ -244,17 +244,35 @@ def read_each(
 
 
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, from the index if possible."""
+    """Yield the rows of all files below a folder, or of one file, for unchanged files from the index."""
     files = dict(run_files(root))
     # A finished file replaces its partial file.
     for path in [path for path in files if path.name.endswith(PARTIAL_SUFFIX)]:
         if _final(path) in files:
             del files[path]
-    if index:
-        yield from _indexed(root, files)
-    else:
-        for path in files:
-            yield from _read(path)
+    place = _index_place(root)
+    known, now = _stored(place) if index else {}, time.time()
+    kept: Index = {}
+    for path, status in files.items():
+        name = os.path.relpath(path, root)
+        # The inode's change time cannot be set back, unlike the modification time.
+        identity = f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
+        entry = known.get(name)
+        if entry is not None and entry[0] == identity:
+            kept[name] = entry
+            for member, values, config in json.loads(entry[1]):
+                # The same folder may have another path in the next call.
+                yield Row(values | {"path": str(path / member)}, config)
+            continue
+        own = _read(path)
+        yield from own
+        found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
+        # Damaged files are read again, because the message is part of the result.
+        if own and len(found) == len(own) and now - status.st_mtime >= _TIMESTAMP_RESOLUTION:
+            rows = [(row.path.relative_to(path).as_posix(), row.values, row.config) for row in found]
+            kept[name] = identity, json.dumps(rows)
+    if index and kept != known:
+        _write(place, kept)
 
 
 def _final(partial: Path) -> Path:
@@ -291,10 +309,10 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, after checking that all columns and actions can be read."""
-    config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), curves_of(file)
+    config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), columns_of(file)
     actions_of(file)
-    # Invalid sections ``method`` are reported here instead of in tables.
-    row_count(config["method"])
+    if columns and (missing := [name for name in ITERATION_COLUMNS if name not in columns]):
+        raise ValueError(f"iterations lack {missing[0]}")
     evaluation, phases, origin = summary["evaluation"], summary["wall_time"], summary["provenance"]
     known = {
         "task": config["task"]["name"],
@@ -321,40 +339,6 @@ def _row(file: h5py.File, path: Path) -> Row:
 # ------------------------------------------------------------------------------------------------------ index
 
 
-def _indexed(root: Path, files: Mapping[Path, os.stat_result]) -> Iterator[Row | ResultsError]:
-    """Yield the rows of files below a folder, from the index for unchanged files."""
-    place = _index_place(root)
-    known = _stored(place)
-    now, changed = time.time(), False
-    kept: Index = {}
-    for path, status in files.items():
-        name = os.path.relpath(path, root)
-        # The inode's change time cannot be set back, unlike the modification time.
-        identity = f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
-        entry = known.get(name)
-        if entry is not None and entry[0] == identity:
-            kept[name] = entry
-            for member, values, config in entry[1]:
-                # The same folder may have another path in the next call.
-                own_path = str(path / member) if member else str(path)
-                yield Row(json.loads(values) | {"path": own_path}, json.loads(config))
-            continue
-        own = _read(path)
-        yield from own
-        found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
-        # Damaged files are read again, because the message is part of the result.
-        if own and len(found) == len(own) and now - status.st_mtime >= _TIMESTAMP_RESOLUTION:
-            kept[name] = identity, [_index_entry(path, row) for row in found]
-            changed = True
-    if changed or len(kept) < len(known):
-        _write(place, kept)
-
-
-def _index_entry(path: Path, row: Row) -> tuple[str, str, str]:
-    member = row.path.relative_to(path).as_posix() if row.path != path else ""
-    return member, json.dumps(row.values | {"path": ""}), json.dumps(row.config)
-
-
 def _index_place(root: Path) -> Path:
     """Return the path of the index: in the folder if it is writable, otherwise in the user's cache folder."""
     if root.is_dir() and os.access(root, os.W_OK):
@@ -369,25 +353,23 @@ def _stored(place: Path) -> Index:
         return {}
     import duckdb
 
-    known: Index = {}
     with suppress(duckdb.Error), duckdb.connect() as connection:
-        query = "SELECT file, identity, member, row, config FROM read_parquet(?)"
-        for file, identity, *parts in connection.execute(query, [str(place)]).fetchall():
-            known.setdefault(file, (identity, []))[1].append(tuple(parts))
-    return known
+        found = connection.execute("SELECT file, identity, rows FROM read_parquet(?)", [str(place)])
+        return {file: (identity, rows) for file, identity, rows in found.fetchall()}
+    return {}
 
 
 def _write(place: Path, entries: Index) -> None:
     """Replace the index, if the folder is writable."""
     import duckdb
 
-    table = [(name, identity, *parts) for name, (identity, own) in entries.items() for parts in own]
+    table = [(name, *entry) for name, entry in entries.items()]
     temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         with duckdb.connect() as connection:
-            columns = ["file", "identity", "member", "row", "config"]
-            connection.register("entries", pd.DataFrame(table, columns=columns, dtype=object))
+            frame = pd.DataFrame(table, columns=["file", "identity", "rows"], dtype=object)
+            connection.register("entries", frame)
             target = str(temporary).replace("'", "''")
             connection.execute(f"COPY entries TO '{target}' (FORMAT parquet, COMPRESSION zstd)")
         os.replace(temporary, place)
