@@ -15,29 +15,6 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError, ConfigError, pick
 
-__all__ = [
-    "OBSERVED_PARTICLES",
-    "TARGET_ENTRIES",
-    "TARGET_MASS",
-    "TERMS",
-    "Scores",
-    "batch_scores",
-    "chamfer_distance",
-    "check_terms",
-    "earth_movers_distance",
-    "mass_change",
-    "mass_portions",
-    "rewards",
-    "score_scale",
-    "scores",
-    "scores_from_iou",
-    "soft_iou",
-    "spread_mass",
-    "target_observation",
-    "target_sdf",
-    "total_loss",
-]
-
 OBSERVED_PARTICLES = 200
 """Least number of particles in an observation: every (particle count // this)-th is observed."""
 
@@ -120,14 +97,8 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
 
 
 def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
-    """Distance of every grid node to the nearest node of the target.
-
-    Args:
-        mass: Mass tensor of the target, shape [n, n, n].
-        threshold: Mass above which a node belongs to the target.
-
-    Returns:
-        Distance [domain units], shape [n, n, n]; 0 on the target's nodes.
+    """Return the distance of every grid node to the nearest node of the target [domain units], shape [n, n,
+    n]. Nodes with a mass above ``threshold`` belong to the target.
 
     Raises:
         ValueError: If no node exceeds the threshold.
@@ -145,15 +116,10 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
 
 
 def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
-    """Soft intersection over union of two mass tensors, each divided by its own maximum.
+    """Return the soft intersection over union of two mass tensors of one shape, each divided by its maximum.
 
-    Args:
-        a: Mass tensor, any shape.
-        b: Mass tensor of the same shape.
-
-    Returns:
-        ``sum(a b) / sum(a + b - a b)``, in [0, 1]; symmetric, and not 1 for a tensor and itself unless it is
-        binary.
+    It is ``sum(a b) / sum(a + b - a b)``, in [0, 1]; symmetric, and not 1 for a tensor and itself unless it
+    is binary.
 
     Raises:
         ValueError: If the shapes differ or a tensor has no mass.
@@ -185,26 +151,18 @@ def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PORTIONS) -> float:
-    """Earth mover's distance between two mass tensors: least mean distance to transport one into the other.
+    """Return the earth mover's distance of two mass tensors, shape [n, n, n]: the least mean distance
+    [domain units] to transport one into the other.
 
-    Both tensors are divided into portions of equal mass, of neighbouring nodes along a space-filling curve,
-    which are matched optimally. For shapes far apart the result is exact up to the size of a portion.
-
-    Args:
-        a: Mass tensor, shape [n, n, n].
-        b: Mass tensor of the same shape.
-        points: Number of portions.
-
-    Returns:
-        Distance [domain units]; 0 for equal tensors.
+    Both tensors are divided into ``points`` portions of equal mass, of neighbouring nodes along a
+    space-filling curve, which are matched optimally. For shapes far apart the result is exact up to the size
+    of a portion.
     """
     # Imported here, because SciPy would slow down every `--help`.
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    distances = cdist(
-        mass_portions(np.asarray(a, np.float64), points), mass_portions(np.asarray(b, np.float64), points)
-    )
+    distances = cdist(*(mass_portions(np.asarray(mass, np.float64), points) for mass in (a, b)))
     return float(distances[linear_sum_assignment(distances)].mean())
 
 
@@ -224,44 +182,25 @@ def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
 
 
 def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
-    """Score an episode by its first and last mass tensor.
-
-    Args:
-        initial: Mass tensor at the start, shape [n, n, n].
-        final: Mass tensor after the last step, shape [n, n, n].
-        target: Mass tensor of the target, shape [n, n, n].
-
-    Returns:
-        The IoUs and both scores.
-    """
+    """Score an episode by the mass tensors of its first and last state and of the target, shape [n, n, n]
+    each."""
     return scores_from_iou(soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target))
 
 
 def scores_from_iou(start: float, end: float, best: float) -> Scores:
-    """Score an episode by soft IoUs with its target.
+    """Score an episode by the soft IoUs of its initial and final mass tensor and of the target itself
+    (``best``) with the target.
 
     If the initial shape has the IoU of the target itself, so that the formulas divide by zero, the score is 1
     if the final shape has it, too, and 0 otherwise.
-
-    Args:
-        start: Soft IoU of the initial mass tensor.
-        end: Soft IoU of the final mass tensor.
-        best: Soft IoU of the target itself.
-
-    Returns:
-        The IoUs and both scores.
     """
     (score,), (printed,) = batch_scores(score_scale([start], [best]), np.array([end]))
     return Scores(start, end, best, score_printed=float(printed), score=float(score))
 
 
 def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
-    """Return the constants of :func:`batch_scores`, shape [4, 2, batch].
-
-    Args:
-        start: Soft IoUs of the initial mass tensors, shape [batch].
-        best: Soft IoUs of the targets themselves, shape [batch].
-    """
+    """Return the constants of :func:`batch_scores`, shape [4, 2, batch], for soft IoUs of the initial mass
+    tensors and of the targets themselves, shape [batch] both."""
     start = np.broadcast_to(np.asarray(start, np.float64), (2, np.size(start)))
     best = np.stack([np.asarray(best, np.float64), np.ones_like(start[0])])
     nothing_to_gain = best - start <= 1e-12
@@ -271,14 +210,11 @@ def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
 
 
 def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
-    """Score many episodes as :func:`scores_from_iou`.
+    """Return ``score`` and ``score_printed``, shape [batch], as :func:`scores_from_iou`; arrays or tensors.
 
     Args:
-        scale: From :func:`score_scale`, an array or a tensor like ``end``.
-        end: Soft IoUs of the final mass tensors, shape [batch]; an array or a tensor.
-
-    Returns:
-        ``score`` and ``score_printed``, like ``end``.
+        scale: Constants from :func:`score_scale`.
+        end: Soft IoUs of the final mass tensors, shape [batch].
     """
     start, way, least, nothing_to_gain = scale
     score, printed = (end - start) / way + (end >= least) * nothing_to_gain
@@ -296,11 +232,8 @@ def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Describe a target for an observation by its excess and missing mass.
-
-    Args:
-        start: Mass tensor of the initial state, shape [n, n, n].
-        target: That of the target.
+    """Describe a target by excess and missing mass, for mass tensors of the initial state and of the target,
+    shape [n, n, n].
 
     Returns:
         Excess mass, then missing mass: fraction of all mass, centroid (3) and standard deviation along each
@@ -319,30 +252,15 @@ def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def total_loss(terms: Any, weights: Any) -> Any:
-    """Return the weighted sum of the loss terms of a step.
-
-    Args:
-        terms: Unweighted terms, shape [..., term]; an array or a tensor.
-        weights: Their weights, shape [term], like ``terms``.
-
-    Returns:
-        Loss, shape [...], like ``terms``.
-    """
+    """Return the weighted sum, shape [...], of the loss terms of a step, shape [..., term], with ``weights``,
+    shape [term]; arrays or tensors."""
     # Not a matrix product, whose rounding depends on the number of losses.
     return (terms * weights).sum(-1)
 
 
 def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
-    """Reward of each step: the loss at the initial state minus the loss after the step.
-
-    Args:
-        initial_terms: Loss terms of the initial state, shape [..., term]; an array or a tensor.
-        step_terms: Loss terms after each environment step, shape [..., T, term], likewise.
-        weights: Weights of the terms, shape [term], likewise.
-
-    Returns:
-        Rewards, shape [..., T], like the terms.
-    """
+    """Return the reward of each step, shape [..., T]: the loss of the initial state, with terms of shape
+    [..., term], minus that after the step, with terms of shape [..., T, term]; arrays or tensors."""
     return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
 
 

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from plab.cli.command import command_line
 from plab.errors import ArgumentError, pick
 
-__all__ = ["BENCHMARKS", "main"]
-
 BENCHMARKS = ("speed", "accuracy", "stability", "unseen")
 
 

@@ -19,8 +19,6 @@ from plab.problem import fits
 from plab.results import read
 from plab.runners.policy import load_policy
 
-__all__ = ["main"]
-
 Policy = Callable[[Any], np.ndarray]
 """Actions, shape [environment, action], for observations of all environments."""
 

@@ -21,8 +21,6 @@ from gymnasium.spaces import Box, Dict, Space
 from plab.errors import PlabError
 from plab.files import complete_folder
 
-__all__ = ["DatasetError", "Episode", "metadata_of", "read_episodes", "write_dataset"]
-
 EXAMPLE = Path(__file__).parent / "dataset"
 """The dataset ``example``: ``plab dataset task=Move observe_particles=20``."""
 

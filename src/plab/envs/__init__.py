@@ -20,15 +20,10 @@ ENTRY_POINT = "plab.envs.single:PlabEnv"
 
 
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Create an environment of the suite.
+    """Create an environment of the suite, such as ``make("Rope")``.
 
-    Args:
-        task: Name of the task, such as ``Rope``.
-        variant: Number of the variant.
-        **kwargs: Arguments of :class:`plab.envs.single.PlabEnv`, or of ``gymnasium.make``.
-
-    Raises:
-        gymnasium.error.Error: If there is no such task or variant.
+    Other arguments are those of :class:`plab.envs.single.PlabEnv` and of ``gymnasium.make``, which raises
+    ``gymnasium.error.Error`` if there is no such task or variant.
     """
     return gymnasium.make(f"plab/{task}-v{variant}", **kwargs)
 
@@ -38,14 +33,7 @@ def make_vec(
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """Create several environments of the suite that share one simulator.
 
-    Args:
-        task: Name of the task, such as ``Rope``.
-        variant: Number of the variant.
-        num_envs: Number of environments.
-        **kwargs: Arguments of :class:`plab.envs.vector.PlabVectorEnv`, or of ``gymnasium.make_vec``.
-
-    Raises:
-        gymnasium.error.Error: If there is no such task or variant.
+    Other arguments are those of :class:`plab.envs.vector.PlabVectorEnv` and of ``gymnasium.make_vec``.
     """
     return gymnasium.make_vec(f"plab/{task}-v{variant}", num_envs=num_envs, **kwargs)
 

@@ -1,8 +1,7 @@
-"""Simulator as functions that PyTorch differentiates.
+"""Differentiable PyTorch functions of the simulator: trajectory losses of actions, states for custom losses,
+also with respect to initial state and material, and closed-loop policy gradients.
 
-Differentiable PyTorch functions of the simulator: trajectory losses of actions, states for custom losses,
-also with respect to initial state and material, and closed-loop policy gradients. With ``sim.device=cuda``
-tensors stay on the device.
+With ``sim.device=cuda`` tensors stay on the device.
 """
 
 from __future__ import annotations
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from plab.problem import Problem
     from plab.sim import RecordedStates, Simulator, State
 
-__all__ = ["PolicySteps", "States", "policy_gradient", "rollout", "simulate"]
-
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
     """Simulate actions from the initial states and return the trajectory losses, differentiable with respect
@@ -32,8 +29,8 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
 
     The contact model is that of the problem's simulator. The gradient is for a sequence of independent
     actions: it does not include dependencies of the actions, such as on observations. Actions outside [-1, 1]
-        are clipped and have no gradient. The gradient is computed together with the losses if the
-    actions require gradients; second derivatives are not supported.
+    are clipped and have no gradient. The gradient is computed together with the losses if the actions require
+    gradients; second derivatives are not supported.
 
     Args:
         problem: Scenes, targets and simulator.
@@ -159,7 +156,10 @@ class _States(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         if material is not None:
             simulator.set_material(*np.moveaxis(_numbers(material), -1, 0))
-        _start(simulator, {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None})
+        parts = {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None}
+        if parts:
+            simulator.reset()
+            simulator.set_initial_state(replace(simulator.state(), **parts))
         given = _given(actions, simulator)
         recording = simulator.record(given, every_step=every_step, mass=mass, gradient=gradient)
         ctx.simulator, ctx.recording = simulator, recording
@@ -179,27 +179,18 @@ class _States(torch.autograd.Function):
             if bar is not None and bar.numel()
         }
         actions, material, *initial = ctx.likes
-        gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions)]
+        gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions), None]
         if ctx.needs_input_grad[5]:
             by_material = ctx.simulator.material_gradient()
             if by_material.ndim > material.ndim:
                 # One for all bodies.
                 by_material = by_material.sum(axis=1)
-            gradients.append(torch.as_tensor(by_material).to(material))
-        else:
-            gradients.append(None)
+            gradients[1] = torch.as_tensor(by_material).to(material)
         wanted = ctx.needs_input_grad[6:]
         state: State | None = ctx.simulator.state_gradient() if any(wanted) else None
         for name, like, asked in zip(_FIELDS, initial, wanted, strict=True):
             gradients.append(torch.as_tensor(getattr(state, name)).to(like) if asked else None)
         return None, None, None, None, *gradients
-
-
-def _start(simulator: Simulator, parts: dict[str, np.ndarray]) -> None:
-    """Replace parts of the initial state."""
-    if parts:
-        simulator.reset()
-        simulator.set_initial_state(replace(simulator.state(), **parts))
 
 
 class PolicySteps(NamedTuple):

@@ -34,18 +34,6 @@ if TYPE_CHECKING:
 
     from plab.render import Renderer
 
-__all__ = [
-    "METADATA",
-    "EpisodeBatch",
-    "EpisodeState",
-    "Restorable",
-    "Transition",
-    "check_render_mode",
-    "compose_configs",
-    "info_of",
-    "make_batch",
-]
-
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor if the caller passed one."""
 
@@ -73,40 +61,20 @@ def _alone(method: _Method) -> _Method:
 
 
 @_alone
-def make_batch(
-    task: str,
-    variant: str,
-    *,
-    num_envs: int = 1,
-    overrides: Sequence[str] = (),
-    overrides_per_env: Sequence[Sequence[str]] | None = None,
-    config_dir: str | Path | None = None,
-    **options: Any,
-) -> EpisodeBatch:
+def make_batch(task: str, variant: str, **options: Any) -> EpisodeBatch:
     """Create the episodes of an environment.
 
     Args:
         task: Name of the task.
         variant: Name of its variant.
-        num_envs: Number of sub-environments.
-        overrides: Overrides for all of them, as on the command line: ``["sim.device=cuda"]``.
-        overrides_per_env: Further overrides, one list per sub-environment, such as ``[["variant=1"],
-            ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
-        config_dir: Folder with YAML files of the user's own.
-        **options: Keyword arguments of :class:`EpisodeBatch`.
+        **options: Other arguments of :func:`compose_configs`, and keyword arguments of :class:`EpisodeBatch`.
 
     Raises:
         ValueError: If an argument is invalid; see also :class:`EpisodeBatch`.
     """
-    cfgs = compose_configs(
-        task,
-        variant,
-        num_envs=num_envs,
-        overrides=overrides,
-        overrides_per_env=overrides_per_env,
-        config_dir=config_dir,
-    )
-    return EpisodeBatch(cfgs, **{"stages": True} | options)
+    names = ("num_envs", "overrides", "overrides_per_env", "config_dir")
+    own = {name: options.pop(name) for name in names if name in options}
+    return EpisodeBatch(compose_configs(task, variant, **own), **{"stages": True} | options)
 
 
 def compose_configs(
@@ -124,12 +92,10 @@ def compose_configs(
         task: Name of the task.
         variant: Name of its variant.
         num_envs: Number of sub-environments.
-        overrides: Overrides for all of them, as on the command line.
-        overrides_per_env: Further overrides, one list per sub-environment.
+        overrides: Overrides for all of them, as on the command line: ``["sim.device=cuda"]``.
+        overrides_per_env: Further overrides, one list per sub-environment, such as ``[["variant=1"],
+            ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
         config_dir: Folder with YAML files of the user's own.
-
-    Returns:
-        The checked configurations.
 
     Raises:
         ValueError: If numbers do not match, or overrides are not lists or set the task.
@@ -152,9 +118,8 @@ def compose_configs(
 
 def check_render_mode(render_mode: str | None) -> str | None:
     """Return a render mode; ValueError if there is none of this name."""
-    modes = METADATA["render_modes"]
-    if render_mode is not None and render_mode not in modes:
-        raise ArgumentError(f"render_mode '{render_mode}' is not one of {', '.join(modes)}")
+    if render_mode not in (None, *METADATA["render_modes"]):
+        raise ArgumentError(f"render_mode '{render_mode}' must be rgb_array or None")
     return render_mode
 
 
@@ -306,14 +271,7 @@ class EpisodeBatch:
         """Replace the sub-environments by others of the same kind, without recompilation; the episodes start
         at :meth:`reset`.
 
-        Args:
-            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
-
-        Raises:
-            ValueError: If their number or the entries of observations differ.
-            plab.config.ConfigError: If the configurations are incompatible.
-            plab.scenes.SceneError: If a scene cannot be simulated or is of another kind.
-            plab.targets.TargetError: If a target cannot be built.
+        ``cfgs`` and errors are those of the constructor; there must be as many sub-environments as before.
         """
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
@@ -355,7 +313,7 @@ class EpisodeBatch:
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
             self.problem.refresh()
-            self._observer = Observer(self.problem, self.configs[0])
+            self._new_observer()
         self._steps: np.ndarray | None = None
         self._over = np.zeros(self.size, bool)
         # Environments with the same configuration have independent samples.
@@ -372,15 +330,15 @@ class EpisodeBatch:
         self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
-        self._initial = self._last = self._seen()
+        measured = self._measured()
+        self._initial = self._last = (self._observe(), *measured)
         self._initial_loss = Constants(self.problem.loss_of(self._initial[1]))
 
     @property
     def problem(self) -> Problem:
         """Scenes, targets and simulator of the sub-environments.
 
-        Raises:
-            RuntimeError: If the environment is closed.
+        RuntimeError if the environment is closed.
         """
         if self._problem is None:
             raise RuntimeError("the environment is closed: make a new one")
@@ -396,6 +354,9 @@ class EpisodeBatch:
     @property
     def _simulator(self) -> Simulator:
         return self.problem.simulator
+
+    def _new_observer(self) -> None:
+        self._observer = Observer(self.problem, self.configs[0])
 
     @_alone
     def reset(
@@ -423,13 +384,13 @@ class EpisodeBatch:
 
         Raises:
             ValueError: If an option is invalid.
-            RuntimeError: If the environment is closed or its simulator is invalid.
+            RuntimeError: If the environment is closed or its simulator is invalid; also in the other methods.
         """
         if self._simulator.changes != self._changes:
             # The caller has changed scenes, targets or initial states.
             self.changed_by_hand = True
             self.problem.refresh()
-            self._observer = Observer(self.problem, self.configs[0])
+            self._new_observer()
             self._sensors.refresh()
             self._observe_starts()
         rows = list(range(self.size) if environments is None else map(int, environments))
@@ -449,16 +410,16 @@ class EpisodeBatch:
         self._simulator.reset(None if environments is None else rows)
         before = self._last
         if changed or self.draws.changed or environments is not None or on_device(like):
-            terms, iou, *others = self._measured(like)
+            measured = self._measured(like)
             if changed:
-                self._note_starts(rows, terms, iou)
-            self._last = self._observe(like), terms, iou, *others
+                self._note_starts(rows, *measured[:2])
+            self._last = self._observe(like), *measured
         else:
             self._last = self._initial
         self._keep(before, [e for e in range(self.size) if e not in rows])
         # Copies, because callers may keep and modify them.
-        observation, *measured = self._last = _copies(self._last)
-        return mapped(_copy, observation), self._info(*measured)
+        self._last = _copies(self._last)
+        return self._shown()
 
     def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
         """Use the current states as initial states for scores and rewards."""
@@ -469,13 +430,17 @@ class EpisodeBatch:
         loss = self._initial_loss.like(None).copy()
         loss[rows] = _on_host(self.problem.loss_of(terms))[rows]
         self._initial_loss = Constants(loss)
-        self._observer = Observer(self.problem, self.configs[0])
+        self._new_observer()
 
     def _keep(self, before: tuple[Array, ...], rows: Sequence[int]) -> None:
-        """Store the last observations and measures of some environments."""
-        if rows:
-            for table, old in zip(self._last, before, strict=True):
-                mapped(lambda now, then: _restore_rows(now, then, rows), table, old)
+        """Restore the last observations and measures of some environments, arrays or CUDA tensors."""
+
+        def restore(table: Array, old: Array) -> None:
+            kept = old[rows]
+            table[rows] = _tensor_like(table, kept) if on_device(table) else _on_host(kept)
+
+        for table, old in zip(self._last, before, strict=True) if rows else ():
+            mapped(restore, table, old)
 
     def require_running(self, idle: np.ndarray | None = None) -> None:
         """Raise ResetNeeded if an episode has ended, also by divergence, except ``idle`` ones."""
@@ -499,7 +464,6 @@ class EpisodeBatch:
             ValueError: If the shape is wrong or an action is not finite.
             gymnasium.error.ResetNeeded: If no episode has been started, or an episode has ended.
             plab.sim.SimulationError: If a simulation diverges and ``strict`` is True.
-            RuntimeError: If the environment is closed or its simulator is invalid.
         """
         simulator, steps = self._simulator, self._taken(idle=idle)
         # The measures report divergence, too; checking here would wait for the device twice.
@@ -516,8 +480,7 @@ class EpisodeBatch:
             self._failures, measured = error.failures | self._failures, self._measured(actions)
         before, self._last = self._last, (observation, *measured)
         self._keep(before, list(self._failures))
-        observation, *measured = _copies(self._last)
-        info = self._info(*measured)
+        observation, info = self._shown()
         reward = self._initial_loss.like(actions) - info["loss"]
         if self._stages:
             reward = self._go_on(self._stages, reward, info, actions)
@@ -541,9 +504,9 @@ class EpisodeBatch:
         if rows:
             stages.earned[rows] = _on_host(reward)[rows]
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
-            terms, iou, *others = self._measured(like)
-            self._note_starts(rows, terms, iou)
-            before, self._last = self._last, (self._observe(like), terms, iou, *others)
+            measured = self._measured(like)
+            self._note_starts(rows, *measured[:2])
+            before, self._last = self._last, (self._observe(like), *measured)
             self._keep(before, list(self._failures))
         info |= self._stage_info(info["score"])
         return reward
@@ -559,11 +522,7 @@ class EpisodeBatch:
     @_alone
     def get_state(self) -> EpisodeState:
         """Return a copy of the state for :meth:`set_state`; on the CPU the continuation is bitwise
-        reproducible.
-
-        Raises:
-            RuntimeError: If the environment is closed or its simulator is invalid.
-        """
+        reproducible."""
         simulation = self._simulator.state()
         for e in self._failures:
             # Diverged environments are frozen in an arbitrary finite state.
@@ -584,15 +543,8 @@ class EpisodeBatch:
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Restore a state returned by :meth:`get_state` of a batch of the same kind.
-
-        Returns:
-            Observations and ``info`` of the state, as :meth:`reset` returns them.
-
-        Raises:
-            ValueError: If a shape is wrong.
-            RuntimeError: If the environment is closed or its simulator is invalid.
-        """
+        """Restore a state returned by :meth:`get_state` of a batch of the same kind, and return its
+        observations and ``info``; ValueError if a shape is wrong."""
         self._simulator.set_state(state.simulation)
         changed = self.draws.put(dict(enumerate(state.values)))
         if self._stages:
@@ -601,11 +553,15 @@ class EpisodeBatch:
             self._changes = self._simulator.changes
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
-            self._observer = Observer(self.problem, self.configs[0])
+            self._new_observer()
         self._steps = None if state.steps is None else state.steps.copy()
         self._over = state.over.copy()
         self._failures, self._last = dict(state.failures), _copies(state.last)
         self._seeds, self._episodes = list(state.seeds), state.episodes.copy()
+        return self._shown()
+
+    def _shown(self) -> tuple[Any, dict[str, Any]]:
+        """Return copies of the last observations, and ``info``."""
         observation, *measured = _copies(self._last)
         return observation, self._info(*measured)
 
@@ -671,11 +627,7 @@ class EpisodeBatch:
 
     @_alone
     def frames(self) -> tuple[np.ndarray, ...]:
-        """Draw the current states.
-
-        Returns:
-            One picture per sub-environment, shape [height, width, 3], uint8.
-        """
+        """Return a picture of each sub-environment's current state, shape [height, width, 3], uint8."""
         simulator = self._simulator
         if not self._renderers:
             # Imported here, because rendering is optional and its library takes a second to load.
@@ -718,11 +670,6 @@ class EpisodeBatch:
         ]
         return self._sensors.noisy(observation, deviations, rngs, self._observer.constant)
 
-    def _seen(self, like: Array = None) -> tuple[Array, ...]:
-        """Return observations and measures of the current states."""
-        measured = self._measured(like)
-        return self._observe(like), *measured
-
     def _measured(self, like: Array = None) -> tuple[Array, ...]:
         """Return loss terms, IoU and, if requested, impulses of the current states."""
         measures = self._simulator.measure(like)
@@ -758,11 +705,7 @@ class Restorable:
     _arguments: dict[str, Any]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, state and random numbers.
-
-        Raises:
-            TypeError: If the simulator is not as the arguments would make it.
-        """
+        """Return arguments, state and random numbers; TypeError if the simulator was changed directly."""
         batch = self.batch
         if batch.changed_by_hand or batch.problem.simulator.changes != batch._changes:
             raise TypeError(
@@ -805,12 +748,8 @@ def _require_alike(cfgs: Sequence[Config]) -> None:
             raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 
 
-def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
-    """Copy some rows between two tables, both arrays or CUDA tensors."""
-    kept = before[rows]
-    if on_device(table):
-        kept = kept.to(table) if on_device(kept) else table.new_tensor(kept)
-    table[rows] = kept if on_device(table) else _on_host(kept)
+def _tensor_like(table: torch.Tensor, values: Array) -> torch.Tensor:
+    return values.to(table) if on_device(values) else table.new_tensor(values)
 
 
 def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:

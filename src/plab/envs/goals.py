@@ -11,8 +11,6 @@ from gymnasium.spaces import Dict
 
 from plab.errors import ArgumentError
 
-__all__ = ["GoalEnv"]
-
 _NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "target_mass"}
 
 

@@ -17,8 +17,6 @@ from plab.sim import Simulator
 from plab.sim.cameras import FIRST_BODY, CameraSensor
 from plab.sim.tensors import Constants, on_device
 
-__all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "spaces"]
-
 PICTURES = ("depth", "rgb", "segmentation")
 
 OBSERVATIONS = ("state", "particles", "points", "mass", "target_mass", "target_points", "impulses", *PICTURES)
@@ -58,7 +56,12 @@ class Observer:
         size = len(particles)
         rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
         rows.append(self._target.like(rows[0]))
-        return _joined(rows, dtype)
+        if on_device(rows[0]):
+            # A tensor implies that torch has been imported.
+            import torch
+
+            return torch.cat(rows, dim=1)
+        return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
 
     def pull_back(self, bar: Array) -> tuple[Array, Array]:
         """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
@@ -80,13 +83,13 @@ class SurfacePoints:
     CELL = 2.5
     """Edge of a cell [mean particle spacings]."""
 
-    def __init__(self, simulator: Simulator, count: int) -> None:
-        """Initialise with the observed simulator and the number of points."""
-        self._simulator, self._count = simulator, count
+    def __init__(self, simulator: Simulator, count: int, cameras: Sequence[CameraSensor]) -> None:
+        """Initialise with the observed simulator, the number of points, and cameras."""
+        self._simulator, self._count, self._cameras = simulator, count, cameras
         body = simulator.scenes[0].bodies[0]
         self._spacing = (body.volume / body.particles) ** (1 / 3)
 
-    def __call__(self, cameras: Sequence[CameraSensor], like: Array) -> Array:
+    def __call__(self, like: Array) -> Array:
         """Return points of the current states, shape [batch, point, 3], float32. With cameras, a fourth entry
         is 1 for points visible to any of them, otherwise 0. If the surface has fewer particles, interior ones
         are appended. A CUDA tensor if ``like`` is one."""
@@ -106,8 +109,8 @@ class SurfacePoints:
         # Particles of a body are in random order, so the first ones are distributed over its surface.
         first = inside.byte().argsort(dim=1, stable=True)[:, : self._count]
         points = x.gather(1, first[..., None].expand(-1, -1, 3))
-        if cameras:
-            seen = torch.stack([self._sees(sensor, points, like) for sensor in cameras]).any(0)
+        if self._cameras:
+            seen = torch.stack([self._sees(sensor, points, like) for sensor in self._cameras]).any(0)
             points = torch.cat([points, seen[..., None].float()], dim=2)
         return points if on_device(like) else points.numpy()
 
@@ -169,22 +172,26 @@ class Sensors:
         }
         if not self.names or (self._pictures and not self.cameras):
             raise ArgumentError("nothing is observed: name observations, and cameras for pictures")
-        self._simulator: Simulator | None = simulator
         looking = self._pictures or "points" in self.names
         self._cameras = {name: CameraSensor(simulator, one) for name, one in self.cameras.items() if looking}
-        spaces: dict[str, Space[Any]] = {"state": state_space} if "state" in self.names else {}
-        if "particles" in self.names:
-            spaces["particles"] = Box(0.0, 1.0, (simulator.particle_count, 3), np.float32)
-        if "points" in self.names:
-            self._points = SurfacePoints(simulator, points)
-            spaces["points"] = Box(0.0, 1.0, (points, 4 if self._cameras else 3), np.float32)
-        for name in {"mass", "target_mass"} & set(self.names):
-            spaces[name] = Box(0.0, 1.0, (CELLS,) * 3, np.float32)
-        if "target_points" in self.names:
-            spaces["target_points"] = Box(0.0, 1.0, (points, 3), np.float32)
-        if "impulses" in self.names:
-            spaces["impulses"] = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
-        self._point_count, self._known_target = points, np.empty(0)
+        sensors = list(self._cameras.values())
+        of_points = _OfTargets(simulator, lambda mass: _sampled(mass, points))
+        force = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
+
+        def positions(like: Array) -> Array:
+            return simulator.observe(1, like)[..., :3]
+
+        sources: dict[str, tuple[Space[Any], Callable[[Array], Array] | None]] = {
+            "state": (state_space, None),
+            "particles": (_unit(simulator.particle_count, 3), positions),
+            "mass": (_unit(CELLS, CELLS, CELLS), lambda like: _shares(positions(like))),
+            "impulses": (force, simulator.impulses),
+            "target_mass": (_unit(CELLS, CELLS, CELLS), _OfTargets(simulator, coarse_shares)),
+            "target_points": (_unit(points, 3), of_points),
+            "points": (_unit(points, 4 if sensors else 3), SurfacePoints(simulator, points, sensors)),
+        }
+        spaces = {name: space for name, (space, _) in sources.items() if name in self.names}
+        self._sources = {name: sources[name][1] for name in spaces}
         for name, camera in self.cameras.items():
             width, height = camera.size
             known: dict[str, Space[Any]] = {
@@ -196,11 +203,9 @@ class Sensors:
         self._alone = isinstance(observe, str) and len(spaces) == 1
         self.space = next(iter(spaces.values())) if self._alone else Dict(spaces)
 
-    _points: SurfacePoints | None = None
-
     def release(self) -> None:
         """Let go of the simulator and its memory."""
-        self._simulator, self._cameras, self._points = None, {}, None
+        self._sources, self._cameras = {}, {}
 
     def refresh(self) -> None:
         """Follow a change of the simulator's scenes."""
@@ -210,48 +215,22 @@ class Sensors:
     def __call__(self, state: Callable[[], Array], like: Array) -> Any:
         """Return observations of the current states; ``state`` is the function for the observation of this
         name. CUDA tensors if ``like`` is one."""
-        out = {"state": state()} if "state" in self.names else {}
-        if "particles" in self.names:
-            x = cast(Simulator, self._simulator).observe(1, like)[..., :3]
-            out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
-        if "mass" in self.names:
-            out["mass"] = _shares(cast(Simulator, self._simulator).observe(1, like)[..., :3])
-        if "impulses" in self.names:
-            impulses = cast(Simulator, self._simulator).impulses(like)
-            out["impulses"] = impulses.float() if on_device(impulses) else impulses.astype(np.float32)
-        for name, values in self._target_observations().items():
-            known = values.like(like)
-            out[name] = known.float() if on_device(known) else known.astype(np.float32)
-        if self._points is not None:
-            out["points"] = self._points(list(self._cameras.values()), like)
+        out = {
+            name: state() if source is None else _single(source(like))
+            for name, source in self._sources.items()
+        }
         for name, sensor in self._cameras.items() if self._pictures else ():
             for picture, values in sensor.capture(*self._pictures, like=like).items():
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
         return next(iter(out.values())) if self._alone else out
 
-    def _target_observations(self) -> dict[str, Constants]:
-        """Return the observations of the targets, updated when these change."""
-        names = {"target_mass", "target_points"} & set(self.names)
-        masses: Any = cast(Simulator, self._simulator).target_mass if names else self._known_target
-        if masses is not self._known_target:
-            self._known_target, made = masses, {}
-            if "target_mass" in names:
-                made["target_mass"] = np.stack([coarse_shares(mass) for mass in masses])
-            if "target_points" in names:
-                made["target_points"] = np.stack([_sampled(mass, self._point_count) for mass in masses])
-            self._targets = {name: Constants(values) for name, values in made.items()}
-        return self._targets if names else {}
-
     def noisy(
         self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
     ) -> Any:
-        """Return observations with Gaussian noise, within their space; colours and labels have no noise.
+        """Return observations of a batch with Gaussian noise, within their space; colours and labels have no
+        noise, nor have the last ``constant`` entries of ``state``.
 
-        Args:
-            observation: Observations of a batch.
-            deviations: Standard deviations, shape [batch].
-            rngs: Generators of the noise, one per environment, independent of device and batch.
-            constant: Number of last entries of ``state`` without noise.
+        ``deviations`` are standard deviations, shape [batch]; ``rngs`` are one generator per environment.
         """
 
         def one(name: str, values: Array, space: Box) -> Array:
@@ -276,6 +255,28 @@ class Sensors:
             return one(self.names[0], observation, cast(Box, self.space))
         spaces = cast(Dict, self.space).spaces
         return {name: one(name, values, cast(Box, spaces[name])) for name, values in observation.items()}
+
+
+class _OfTargets:
+    """An observation of the targets' mass tensors, updated when these change."""
+
+    def __init__(self, simulator: Simulator, observe: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._simulator, self._observe = simulator, observe
+        self._known: np.ndarray | None = None
+
+    def __call__(self, like: Array) -> Array:
+        masses = self._simulator.target_mass
+        if masses is not self._known:
+            self._known, self._values = masses, Constants([self._observe(mass) for mass in masses])
+        return self._values.like(like)
+
+
+def _unit(*shape: int) -> Box:
+    return Box(0.0, 1.0, shape, np.float32)
+
+
+def _single(values: Array) -> Array:
+    return values.float() if on_device(values) else values.astype(np.float32)
 
 
 def coarse_shares(mass: np.ndarray) -> np.ndarray:
@@ -317,15 +318,6 @@ def mapped(function: Callable[..., Any], *observations: Any) -> Any:
     return {key: function(*(one[key] for one in observations)) for key in observations[0]}
 
 
-def _joined(rows: Sequence[Array], dtype: type) -> Array:
-    if on_device(rows[0]):
-        # A tensor implies that torch has been imported.
-        import torch
-
-        return torch.cat(list(rows), dim=1)
-    return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
-
-
 def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
     """Return the indices of the entries that are positions along x and along z, shape [2, position]: of the
     observed particles, of the manipulators and, if it is observed, of the target."""
@@ -357,15 +349,11 @@ def _count(scene: Scene, least: int) -> int:
 
 def _target_observations(problem: Problem) -> np.ndarray:
     """Return the description of each environment's target, shape [batch, 14]."""
-    found: dict[bytes, np.ndarray] = {}
-    rows = []
-    for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
-        # Targets may repeat within a batch.
-        key = b"".join(mass.tobytes() for mass in masses)
-        if key not in found:
-            found[key] = target_observation(*masses)
-        rows.append(found[key])
-    return np.array(rows)
+    pairs = list(zip(problem.initial_mass, problem.target_mass, strict=True))
+    # Targets may repeat within a batch.
+    keys = [b"".join(mass.tobytes() for mass in masses) for masses in pairs]
+    found = {key: target_observation(*masses) for key, masses in dict(zip(keys, pairs, strict=True)).items()}
+    return np.array([found[key] for key in keys])
 
 
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:

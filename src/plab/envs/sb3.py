@@ -17,8 +17,6 @@ from plab.envs.core import METADATA, EpisodeBatch, check_render_mode, info_of, m
 from plab.envs.observations import mapped
 from plab.errors import ArgumentError
 
-__all__ = ["PlabVecEnv", "make_sb3"]
-
 
 def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> PlabVecEnv:
     """Create the environments of a registered id.
@@ -27,13 +25,13 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
         env_id: Such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
         render_mode: ``rgb_array``, or None for no pictures.
-        **options: Arguments of :func:`plab.envs.core.make_batch` and :class:`plab.envs.core.EpisodeBatch`.
-            With several observations, the policy must accept dictionaries, such as ``MultiInputPolicy``.
+        **options: Arguments of :func:`plab.envs.core.compose_configs` and
+            :class:`plab.envs.core.EpisodeBatch`, which have the errors, too. With several observations, the
+            policy must accept dictionaries, such as ``MultiInputPolicy``.
 
     Raises:
         gymnasium.error.Error: If there is no such id.
-        ValueError: If an argument is invalid, or the id is not one of plab's; see also
-            :class:`plab.envs.core.EpisodeBatch`.
+        ValueError: If the id is not one of plab's.
     """
     spec = gymnasium.spec(env_id)
     if spec.entry_point != ENTRY_POINT:
@@ -83,9 +81,7 @@ class PlabVecEnv(VecEnv):
         ``reset_infos``. ``seed`` and ``set_options`` are those of :meth:`plab.envs.single.PlabEnv.reset`;
         options are the same for all sub-environments."""
         if any(options != self._options[0] for options in self._options):
-            raise ArgumentError(
-                "options differ between sub-environments: give values one per sub-environment"
-            )
+            raise ArgumentError("options differ between sub-environments: give one value for each")
         seeds = [seed for seed in self._seeds if seed is not None] or None
         observation, info = self.batch.reset(seeds=seeds, options=self._options[0], episode=self.next_episode)
         self.next_episode = None
@@ -101,12 +97,7 @@ class PlabVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Advance all sub-environments by one step, and reset them if that ends their episodes.
 
-        Returns:
-            Observations, rewards, whether the episodes are over, and an info per sub-environment.
-
-        Raises:
-            ValueError: If the actions' shape is wrong or one is not finite.
-            gymnasium.error.ResetNeeded: If no episode has been started.
+        Errors are those of :meth:`plab.envs.core.EpisodeBatch.step`.
         """
         if not self.together:
             self.batch.require_running()
@@ -134,19 +125,11 @@ class PlabVecEnv(VecEnv):
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute, repeated for each sub-environment, because they share all attributes.
-
-        Raises:
-            AttributeError: If there is no such attribute.
-        """
+        """Return an attribute, repeated for each sub-environment, because they share all attributes."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all sub-environments.
-
-        Raises:
-            ValueError: If it is set for some sub-environments only.
-        """
+        """Set an attribute of all sub-environments; ValueError if for some only."""
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
         setattr(self, attr_name, value)
@@ -154,11 +137,7 @@ class PlabVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Raise an error, because there are no separate environment objects.
-
-        Raises:
-            AttributeError: Always.
-        """
+        """Raise AttributeError, because there are no separate environment objects."""
         raise AttributeError(f"sub-environments have no methods of their own, and no '{method_name}'")
 
     def env_is_wrapped(

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike
 from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, info_of, make_batch
 from plab.envs.observations import mapped
 
-__all__ = ["PlabEnv"]
-
 
 class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     """A task as a Gymnasium environment.
@@ -38,13 +36,8 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
             task: Name of the task.
             variant: Name of its variant.
             render_mode: ``rgb_array``, or None for no pictures.
-            **options: Arguments of :func:`plab.envs.core.make_batch` and
-                :class:`plab.envs.core.EpisodeBatch`: ``overrides``, ``config_dir``, ``contact``, ``observe``,
-                ``cameras``, ``randomize``, ``success_score``, ``terminate_on_success``, ``render_size`` and
-                ``render_target``.
-
-        Raises:
-            ValueError: If an argument is invalid; see also :class:`plab.envs.core.EpisodeBatch`.
+            **options: Arguments of :func:`plab.envs.core.compose_configs` and
+                :class:`plab.envs.core.EpisodeBatch`, which have the errors, too.
         """
         self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}
         self.render_mode = check_render_mode(render_mode)
@@ -81,32 +74,20 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
             ValueError: If an option does not fit.
         """
         super().reset(seed=seed)
-        seeds = self._first_seeds(seed)
-        observation, info = self.batch.reset(seeds=seeds, options=options)
-        return _first(observation), info_of(info, 0, {})
+        return _first(*self.batch.reset(seeds=self._first_seeds(seed), options=options))
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one step.
-
-        Args:
-            action: Action, shape [action]; clipped to [-1, 1].
-
-        Returns:
-            Observation, reward, whether terminated, whether truncated, and ``info``.
-
-        Raises:
-            ValueError: If the shape is wrong or an entry is not finite.
-            gymnasium.error.ResetNeeded: If the episode is over.
-        """
+        """Advance by one step with an action, shape [action]; see :meth:`plab.envs.core.EpisodeBatch.step`
+        for errors."""
         self.batch.require_running()
         done = self.batch.step(np.asarray(action)[None], strict=False)
         ends = bool(done.terminated[0]), bool(done.cut_off[0])
-        return _first(done.observation), float(done.reward[0]), *ends, info_of(done.info, 0, done.failures)
+        observation, info = _first(done.observation, done.info, done.failures)
+        return observation, float(done.reward[0]), *ends, info
 
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state from :meth:`get_state`; return its observation and ``info``."""
-        observation, info = self.batch.set_state(state)
-        return _first(observation), info_of(info, 0, state.failures)
+        return _first(*self.batch.set_state(state), state.failures)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""
@@ -120,6 +101,8 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
         self.batch.close()
 
 
-def _first(observation: Any) -> Any:
-    """Return the observation of a batch of one."""
-    return mapped(lambda rows: rows[0], observation)
+def _first(
+    observation: Any, info: Mapping[str, Any], failures: Mapping[int, str] | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Return observation and ``info`` of a batch of one."""
+    return mapped(lambda rows: rows[0], observation), info_of(info, 0, failures or {})

@@ -11,8 +11,6 @@ from plab.config import Config, ConfigError
 from plab.config.randomization import SCENES
 from plab.problem import Problem, make_targets, target_distance
 
-__all__ = ["Stages", "staged"]
-
 
 def staged(cfg: Config) -> bool:
     """Return True if the task has stages before its target.

@@ -11,15 +11,10 @@ from plab.envs.core import EpisodeBatch, Transition
 from plab.envs.observations import mapped
 from plab.sim import Simulator
 
-__all__ = ["TensorEnv", "floating"]
-
 
 def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
-    """Return actions as floating-point numbers: integers are converted to the simulator's precision.
-
-    Raises:
-        TypeError: If they are complex.
-    """
+    """Return actions as floating-point numbers, integers in the simulator's precision; TypeError if they are
+    complex."""
     if actions.is_complex():
         raise TypeError(f"actions must be real numbers, not {actions.dtype}")
     return actions if actions.is_floating_point() else actions.to(getattr(torch, simulator.precision))
@@ -51,26 +46,17 @@ class TensorEnv:
     def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
         """Advance all environments by one step.
 
-        Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1].
-            strict: Whether divergence of an environment is an error; see
-                :meth:`plab.envs.core.EpisodeBatch.step`.
+        Arguments and errors are those of :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
             Tensors; observations are float32, all others have the type of the actions, or the simulator's
             precision for integer actions. ``terminated``, ``truncated`` and sampled parameters are arrays.
-
-        Raises:
-            ValueError: If the shape is wrong or an action is not finite.
-            gymnasium.error.ResetNeeded: If no episode has been started, or it has ended.
-            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
         actions = floating(actions.detach().to(self.device), self.batch.problem.simulator)
         if self.device.type == "cuda":
             return self.batch.step(actions, strict=strict)
         done = self.batch.step(actions.double().numpy(), strict=strict)
         numbers = {name: values for name, values in done.info.items() if name != "randomized"}
-        info = {name: torch.as_tensor(values).to(actions) for name, values in numbers.items()}
-        info = done.info | info
+        info = done.info | {name: torch.as_tensor(values).to(actions) for name, values in numbers.items()}
         reward = torch.as_tensor(done.reward).to(actions)
         return replace(done, observation=mapped(torch.as_tensor, done.observation), reward=reward, info=info)

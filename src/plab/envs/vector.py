@@ -16,8 +16,6 @@ from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode
 from plab.envs.observations import mapped
 from plab.errors import ArgumentError
 
-__all__ = ["PlabVectorEnv"]
-
 
 class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     """Sub-environments simulated as one batch.
@@ -54,12 +52,8 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
                 step after the end of an episode, which ignores the action; ``SameStep`` in the last step of
                 the episode, with the final observation in ``infos["final_obs"]``; ``Disabled`` requires
                 :meth:`reset` with ``options={"reset_mask": ...}``.
-            **options: Arguments of :func:`plab.envs.core.make_batch` and
-                :class:`plab.envs.core.EpisodeBatch`, as of :class:`plab.envs.single.PlabEnv`, and
-                ``overrides_per_env``.
-
-        Raises:
-            ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
+            **options: Arguments of :func:`plab.envs.core.compose_configs` and
+                :class:`plab.envs.core.EpisodeBatch`, which have the errors, too.
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
@@ -109,15 +103,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(self, actions: ArrayLike) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all sub-environments by one step, or start the next episodes of those that have ended.
 
-        Args:
-            actions: Actions, shape [env, action]; clipped to [-1, 1].
-
-        Returns:
-            Observations, rewards, whether terminated, whether truncated, and ``info``.
-
-        Raises:
-            ValueError: If the shape is wrong or an entry is not finite.
-            gymnasium.error.ResetNeeded: If an episode has ended and is not reset automatically.
+        Actions have the shape [env, action]; see :meth:`plab.envs.core.EpisodeBatch.step` for errors.
         """
         idle = self.batch.over if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, bool)
         if idle.all():

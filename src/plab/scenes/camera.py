@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plab.scenes.bodies import SceneError, Vec3, vector3
-
-__all__ = ["Camera"]
+from plab.scenes.scene import SceneError, Vec3, vector3
 
 
 @dataclass(frozen=True)

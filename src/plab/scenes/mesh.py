@@ -17,8 +17,6 @@ import numpy as np
 
 from plab.files import ShapeError, one_line, pinned
 
-__all__ = ["MESHES", "Mesh", "load_mesh", "read_mesh"]
-
 MESHES = (".obj", ".stl", ".ply")
 """Endings of mesh files."""
 
@@ -124,7 +122,6 @@ class Mesh:
         self.extent, self.volume = (high - low) / longest, volume / longest**3
         self.thickness = 4 * volume / float(surface.area) / longest
         self.vertices, self.faces = (surface.vertices - (low / 2 + high / 2)) / longest, surface.faces
-        self._sort_into_squares()
         self._require_volume(file)
 
     def __eq__(self, other: object) -> bool:
@@ -136,16 +133,20 @@ class Mesh:
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return which points, shape [point, 3], are inside, by their winding numbers; bool, shape
         [point]."""
+        from scipy.spatial import KDTree
+
         winding = np.zeros(len(points), dtype=np.int64)
-        square = self._square(points[:, ::2]) @ np.array([self._squares, 1])
-        counts = np.diff(self._ends, prepend=0)[square]
-        starts = self._ends[square] - counts
-        blocks = np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS)) + 1
-        for block in np.split(np.arange(len(points)), blocks):
-            which, nth = _repeated(counts[block])
-            point = block[which]
-            triangle = self._triangles[starts[point] + nth]
-            met, height, sense = self._crossings(points[point][:, ::2], self.faces[triangle])
+        # Seen along y, a point can only be in a triangle whose circle around the centroid holds it.
+        corners = self.vertices[:, ::2][self.faces]
+        middle = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1) * (1 + 1e-9) + 1e-12
+        tree = KDTree(points[:, ::2])
+        counts = tree.query_ball_point(middle, reach, return_length=True)
+        ends = np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS)) + 1
+        for faces in filter(len, np.split(np.arange(len(counts)), ends)):
+            point = np.concatenate(tree.query_ball_point(middle[faces], reach[faces])).astype(np.int64)
+            face = self.faces[np.repeat(faces, counts[faces])]
+            met, height, sense = self._crossings(points[point][:, ::2], face)
             point = point[met]
             above = height > points[point, 1]
             np.add.at(winding, point[above], sense[above])
@@ -167,27 +168,6 @@ class Mesh:
             parts.append(points[self.inside(points)])
             found += len(parts[-1])
         return np.concatenate([np.empty((0, 3)), *parts])[:count]
-
-    def _sort_into_squares(self) -> None:
-        """Sort the triangles into the squares of a grid in (x, z) that they overlap."""
-        corners = self.vertices[:, ::2][self.faces]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        self._squares = min(256, int(np.sqrt(len(self.faces) / 2)) + 1)
-        while True:
-            first, last = self._square(low), self._square(high)
-            wide = last - first + 1
-            # Long triangles overlap many squares, so use fewer squares.
-            if self._squares == 1 or wide.prod(axis=1).sum() <= 8 * len(self.faces) + 65536:
-                break
-            self._squares //= 2
-        triangle, nth = _repeated(wide.prod(axis=1))
-        across = wide[triangle, 1]
-        square = (first[triangle, 0] + nth // across) * self._squares + first[triangle, 1] + nth % across
-        self._triangles = triangle[np.argsort(square, kind="stable")]
-        self._ends = np.cumsum(np.bincount(square, minlength=self._squares**2))
-
-    def _square(self, flat: np.ndarray) -> np.ndarray:
-        return np.clip(((flat + 0.5) * self._squares).astype(np.int64), 0, self._squares - 1)
 
     def _crossings(self, at: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Intersect vertical lines at (x, z), shape [pair, 2], with one triangle each, shape [pair, 3].
@@ -226,9 +206,3 @@ class Mesh:
                 f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
                 "parts that overlap, and let all faces look outwards"
             )
-
-
-def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat each index according to its count, and return the number of each repetition."""
-    index = np.repeat(np.arange(len(counts)), counts)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

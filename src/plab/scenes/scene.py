@@ -8,28 +8,19 @@ target recipes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.scenes.bodies import (
-    BODY_SHAPES,
-    LAWS,
-    MATERIAL_KEYS,
-    Body,
-    Material,
-    MeshBody,
-    SceneError,
-    Vec3,
-    find_law,
-    make_body,
-    vector3,
-)
+from plab.errors import ConfigError, PlabError, pick
+from plab.laws import Law
+from plab.plugins import Registry, load_object
 
 if TYPE_CHECKING:
     from plab.kinematics import Chain
+    from plab.scenes.mesh import Mesh
 
 __all__ = [
     "CONTACTS",
@@ -66,6 +57,211 @@ PRECISIONS = ("float32", "float64")
 
 CONTACTS = ("soft", "hard")
 """Contact models of manipulators and particles."""
+
+
+# ------------------------------------------------------------------------------------------------- bodies
+
+BODY_SHAPES = ("sphere", "box", "mesh")
+"""Values of :attr:`Body.shape`."""
+
+MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
+"""Material parameters that bodies inherit from their scene by default, as fields of a :class:`Material`."""
+
+LAWS: Mapping[str, Law] = Registry(
+    Law,
+    {
+        name: f"plab.laws.{name}:{name.upper()}"
+        for name in ("von_mises", "elastic", "drucker_prager", "fluid", "viscoplastic")
+    },
+)
+"""plab's own laws by name."""
+
+Vec3 = tuple[float, float, float]
+
+
+def vector3(values: Sequence[float]) -> Vec3:
+    """Return three numbers as a tuple; ValueError if they are not three."""
+    x, y, z = values
+    return x, y, z
+
+
+def find_law(name: str) -> Law:
+    """Return a law by its name, or by ``module:NAME`` for a law outside plab; ConfigError if there is
+    none."""
+    if name in LAWS:
+        return LAWS[name]
+    if ":" not in name:
+        raise ConfigError(f"law '{name}' does not exist; {pick(name, list(LAWS))}; or module:NAME")
+    return load_object(name, Law)
+
+
+class SceneError(PlabError, ValueError):
+    """A scene cannot be simulated; the message has the reason and a valid value."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """Material of a body: a law and its parameters.
+
+    Attributes:
+        youngs_modulus: Young's modulus E.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
+        law: Name of the law, see :func:`find_law`.
+        parameters: Other parameters of the law, by name; default: the law's.
+    """
+
+    youngs_modulus: float
+    poisson_ratio: float
+    yield_stress: float
+    law: str = "von_mises"
+    parameters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def kind(self) -> Law:
+        """The law."""
+        return find_law(self.law)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The law's parameters, in its order."""
+        given = {key: getattr(self, key) for key in MATERIAL_KEYS} | dict(self.parameters)
+        return {key: given.get(key, default) for key, default in self.kind.defaults.items()}
+
+    @property
+    def shear_modulus(self) -> float:
+        """Lame parameter mu."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """Lame parameter lambda."""
+        nu = self.poisson_ratio
+        return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+    def largest_step(self, dx: float) -> float:
+        """Return the largest stable time step [s] on a grid of spacing dx."""
+        return self.kind.largest_step(self.values, dx)
+
+    def validate(self, label: str = "") -> None:
+        """Raise SceneError, with a message that begins with ``label``, if a value is out of range."""
+        for name in dict(self.parameters):
+            if name not in self.kind.keys:
+                raise SceneError(
+                    f"{label}{name} is no parameter of law {self.law}: {', '.join(self.kind.keys)}"
+                )
+        for parameter in self.kind.parameters:
+            value = self.values[parameter.name]
+            if not parameter.admits(value):
+                raise SceneError(f"{label}{parameter.name} {value:g} is outside {parameter.interval}")
+
+
+@dataclass(frozen=True)
+class Body:
+    """One body of plasticine, initially filled with particles.
+
+    Attributes:
+        shape: ``sphere`` or ``box``; that of a :class:`MeshBody` is ``mesh``.
+        center: Centre [domain units].
+        size: Sphere: ``(radius,)``. Box: full edge lengths ``(x, y, z)``.
+        particles: Number of particles drawn uniformly inside.
+        youngs_modulus: Young's modulus E; the scene's if None.
+        poisson_ratio: Poisson ratio nu; the scene's if None.
+        yield_stress: von Mises yield stress; the scene's if None.
+        law: Name of its law, see :func:`find_law`; ``von_mises`` if None.
+        parameters: Other parameters of the law, by name.
+    """
+
+    shape: str
+    center: Vec3
+    size: tuple[float, ...]
+    particles: int
+    youngs_modulus: float | None = field(default=None, kw_only=True)
+    poisson_ratio: float | None = field(default=None, kw_only=True)
+    yield_stress: float | None = field(default=None, kw_only=True)
+    law: str | None = field(default=None, kw_only=True)
+    parameters: Mapping[str, float] | tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Make the parameters hashable."""
+        object.__setattr__(self, "parameters", tuple(sorted(dict(self.parameters).items())))
+
+    @property
+    def own_material(self) -> dict[str, Any]:
+        """Fields of its :class:`Material` that differ from the scene's."""
+        values = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law")}
+        own = {key: value for key, value in values.items() if value is not None}
+        return {**own, "parameters": self.parameters} if self.parameters else own
+
+    def half_extent(self) -> np.ndarray:
+        """Half of the bounding box's edges, shape [3]."""
+        return np.full(3, self.size[0]) if self.shape == "sphere" else np.asarray(self.size, dtype=float) / 2
+
+    @property
+    def volume(self) -> float:
+        """Volume at t = 0 [domain units^3]."""
+        return 4 / 3 * math.pi * math.prod(self.size * 3) if self.shape == "sphere" else math.prod(self.size)
+
+
+@dataclass(frozen=True)
+class MeshBody(Body):
+    """A body in the shape of a mesh.
+
+    Attributes:
+        mesh: The mesh; ``center`` is the centre of its bounding box, ``size`` is ``(longest,)``, the longest
+            edge of that box.
+    """
+
+    mesh: Mesh
+
+    def half_extent(self) -> np.ndarray:
+        """See :meth:`Body.half_extent`."""
+        return self.size[0] / 2 * self.mesh.extent
+
+    @property
+    def volume(self) -> float:
+        """See :attr:`Body.volume`."""
+        return math.prod(self.size * 3) * self.mesh.volume
+
+
+def make_body(
+    shape: str,
+    center: Sequence[float],
+    size: Sequence[float],
+    particles: int,
+    file: str | None = None,
+    sha256: str | None = None,
+    **material: Any,
+) -> Body:
+    """Create a body from a configuration, reading the mesh file if any.
+
+    Args:
+        shape: ``sphere``, ``box`` or ``mesh``.
+        center: Centre (x, y, z) [domain units].
+        size: Sphere: radius. Box: edge lengths x, y, z. Mesh: longest edge of its bounding box [domain
+            units].
+        particles: Number of particles.
+        file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
+        sha256: SHA-256 of the file, likewise.
+        **material: Its own law and parameters, as fields of the body.
+
+    Raises:
+        SceneError: If a mesh has no file, or another shape has one.
+        plab.files.ShapeError: If the file cannot be used.
+    """
+    if shape != "mesh":
+        if file is not None:
+            raise SceneError(f"file has no effect with shape {shape}: leave it out, or use shape mesh")
+        return Body(shape, vector3(center), tuple(size), particles, **material)
+    if file is None:
+        raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
+    # Imported here, because few scenes have meshes.
+    from plab.scenes.mesh import load_mesh
+
+    return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256), **material)
+
+
+# ------------------------------------------------------------------------------------------- manipulators
 
 Quaternion = tuple[float, float, float, float]
 
@@ -353,11 +549,8 @@ class Scene:
         if self.kinematics is None:
             del facts["kinematics"]
         for body in facts["bodies"]:
-            for key in MATERIAL_KEYS:
-                if body[key] is None:
-                    del body[key]
-            for key in ("law", "parameters"):
-                if not body[key]:
+            for key in (*MATERIAL_KEYS, "law", "parameters"):
+                if body[key] in (None, (), ""):
                     del body[key]
         return facts
 
@@ -367,12 +560,13 @@ class Scene:
         Raises:
             SceneError: If it cannot; the message names the field and a valid value.
         """
-        _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
+        _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):
             material.validate(f"bodies[{number}]: ")
-        _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
-        _require(self.dt > 0, f"dt {self.dt:g} must be positive")
+        _require(self.substeps >= 1, f"substeps must be at least 1 (got {self.substeps})")
+        _require(self.dt > 0, f"dt must be positive (got {self.dt:g})")
+        _require(self.floor_friction >= 0, f"floor_friction must be at least 0 (got {self.floor_friction:g})")
         if self.dt > self.stable_dt:
             steps = math.ceil(self.substeps * self.dt / self.stable_dt)
             one = self.material_count == 1
@@ -381,94 +575,68 @@ class Scene:
                 f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of {what} and grid: "
                 f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
             )
-        _require(
-            self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
-        )
         for name in ("sampling_convention", "digits_convention", "floor_stencil"):
             choice = getattr(self, name)
             _require(choice in CONVENTIONS, f"{name} '{choice}' is not one of {', '.join(CONVENTIONS)}")
         limit = self.dx / self.dt**2
-        _require(
-            math.hypot(*self.gravity) <= limit,
-            f"gravity {self.gravity} accelerates by more than a cell per substep: use at most {limit:.3g}",
-        )
+        advice = f"accelerates by more than a cell per substep: use at most {limit:.3g}"
+        _require(math.hypot(*self.gravity) <= limit, f"gravity {self.gravity} {advice}")
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
-            self._validate_body(number, body)
+            self._validate_body(f"bodies[{number}]", body)
         count = len(self.manipulators)
         _require(count <= MANIPULATORS_MAX, f"{count} manipulators are more than {MANIPULATORS_MAX}")
         if self.kinematics is not None:
             self._require_slow("kinematics", self.kinematics.largest_step())
         for number, manipulator in enumerate(self.manipulators):
-            self._validate_manipulator(number, manipulator)
+            self._validate_manipulator(f"manipulators[{number}]", manipulator)
 
-    def _validate_body(self, number: int, body: Body) -> None:
-        label = f"bodies[{number}]"
-        _require(
-            body.shape in BODY_SHAPES, f"{label}: shape '{body.shape}' is not one of {', '.join(BODY_SHAPES)}"
-        )
-        _require((body.shape == "mesh") == isinstance(body, MeshBody), f"{label}: a mesh is a MeshBody")
+    def _validate_body(self, label: str, body: Body) -> None:
+        shapes = ", ".join(BODY_SHAPES)
+        _require(body.shape in BODY_SHAPES, f"{label}: shape '{body.shape}' is not one of {shapes}")
         entries = 3 if body.shape == "box" else 1
-        _require(
-            len(body.size) == entries and all(0 < size < math.inf for size in body.size),
-            f"{label}: a {body.shape} needs {entries} positive size(s), not {body.size}",
-        )
+        fits = len(body.size) == entries and all(0 < size < math.inf for size in body.size)
+        _require(fits, f"{label}: a {body.shape} needs {entries} positive size(s), not {body.size}")
         _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
         top = 1.0 - 3.0 * self.dx
-        low = np.asarray(body.center) - body.half_extent()
-        high = np.asarray(body.center) + body.half_extent()
-        for axis, name in enumerate("xyz"):
+        for name, middle, half in zip("xyz", body.center, body.half_extent(), strict=True):
+            low, high = middle - half, middle + half
             # Bodies rest on the floor at y = 0 exactly; rounding errors below it are tolerated.
-            inside = low[axis] >= -1e-9 and high[axis] <= top + 1e-9
-            half = body.half_extent()[axis]
             _require(
-                inside,
-                f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain "
-                f"0 .. {top:.4g}: put its centre's {name} into {half:.3g} .. {top - half:.3g}",
+                low >= -1e-9 and high <= top + 1e-9,
+                f"{label}: reaches {name} = {low:.3g} .. {high:.3g}, outside the domain 0 .. {top:.4g}: "
+                f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
             )
         if isinstance(body, MeshBody):
             thickness = body.size[0] * body.mesh.thickness
+            least = 1.01 * body.size[0] * self.dx / thickness
             _require(
                 thickness >= self.dx,
                 f"{label}: its hydraulic diameter {thickness:.2g} is less than a cell of the grid, "
-                f"{self.dx:.2g}: use a size of {1.01 * body.size[0] * self.dx / thickness:.2g} or more, or a "
-                "finer grid",
+                f"{self.dx:.2g}: use a size of {least:.2g} or more, or a finer grid",
             )
 
-    def _validate_manipulator(self, number: int, manipulator: Manipulator) -> None:
-        label = f"manipulators[{number}]"
-        shape = MANIPULATOR_SHAPES.get(manipulator.shape)
+    def _validate_manipulator(self, label: str, tool: Manipulator) -> None:
+        shape, shapes = MANIPULATOR_SHAPES.get(tool.shape), ", ".join(MANIPULATOR_SHAPES)
         if shape is None:
-            names = ", ".join(MANIPULATOR_SHAPES)
-            raise SceneError(f"{label}: shape '{manipulator.shape}' is not one of {names}")
+            raise SceneError(f"{label}: shape '{tool.shape}' is not one of {shapes}")
+        label = f"{label}: a {tool.shape}"
+        fits = len(tool.size) == len(shape.size_names) and all(0 < size < math.inf for size in tool.size)
         names = ", ".join(shape.size_names)
-        _require(
-            len(manipulator.size) == len(shape.size_names)
-            and all(0 < size < math.inf for size in manipulator.size),
-            f"{label}: a {manipulator.shape} needs positive, finite sizes ({names}), not {manipulator.size}",
-        )
-        scales = manipulator.action_dim if shape.scaled else 0
-        _require(
-            len(manipulator.scale) == scales,
-            f"{label}: a {manipulator.shape} needs {scales} scale(s), not {len(manipulator.scale)}",
-        )
-        norm = math.sqrt(sum(c * c for c in manipulator.rotation))
-        _require(
-            abs(norm - 1.0) < 1e-3, f"{label}: rotation has length {norm:.4g}, not 1: give a unit quaternion"
-        )
-        _require(
-            0 <= manipulator.friction < math.inf,
-            f"{label}: friction {manipulator.friction:g} must not be negative, infinite or NaN",
-        )
+        _require(fits, f"{label} needs positive, finite sizes ({names}), not {tool.size}")
+        scales = tool.action_dim if shape.scaled else 0
+        _require(len(tool.scale) == scales, f"{label} needs {scales} scale(s), not {len(tool.scale)}")
+        norm = math.hypot(*tool.rotation)
+        _require(abs(norm - 1.0) < 1e-3, f"{label} needs a unit quaternion: rotation has length {norm:.4g}")
+        friction = f"{label} has friction {tool.friction:g}: it must be finite and at least 0"
+        _require(0 <= tool.friction < math.inf, friction)
         for name in ("position", "scale"):
-            values = getattr(manipulator, name)
-            _require(all(map(math.isfinite, values)), f"{label}: {name} {values} must be finite numbers")
-        low, high = manipulator.lower_bound, manipulator.upper_bound
-        _require(
-            all(a <= b for a, b in zip(low, high, strict=True)),
-            f"{label}: lower_bound {low} must not be above upper_bound {high}",
-        )
-        self._require_slow(f"{label}: scale {manipulator.scale}", manipulator.largest_step())
+            values = getattr(tool, name)
+            _require(all(map(math.isfinite, values)), f"{label} needs a finite {name}, not {values}")
+        low, high = tool.lower_bound, tool.upper_bound
+        ordered = all(a <= b for a, b in zip(low, high, strict=True))
+        _require(ordered, f"{label} has a lower_bound {low} above its upper_bound {high}")
+        self._require_slow(f"{label}: scale {tool.scale}", tool.largest_step())
 
     def _require_slow(self, label: str, way: float) -> None:
         """Reject motions of more than one cell per substep, which contact at nodes could miss."""
