@@ -22,7 +22,7 @@ import pandas as pd
 from common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.bench.accuracy import angle
 from plab.cli.command import Parser, command_line, positive, task_list, to_write
-from plab.cli.tables import measure_table, write_markdown
+from plab.cli.tables import measure_table
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
@@ -190,7 +190,10 @@ def main(argv: Sequence[str]) -> None:
     if options.markdown is not None:
         worst = precision_summary(pd.DataFrame(table))
         heading = f"float32 against float64, {options.particles} particles, 50 steps.\n\n"
-        write_markdown(options.markdown, heading, list(worst.columns), worst.to_dict("records"))
+        lines = ["| " + " | ".join(worst.columns) + " |", "|" + "---|" * len(worst.columns)]
+        lines += ["| " + " | ".join(map(str, row)) + " |" for row in worst.itertuples(index=False)]
+        options.markdown.parent.mkdir(parents=True, exist_ok=True)
+        options.markdown.write_text(heading + "\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

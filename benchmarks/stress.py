@@ -18,28 +18,21 @@ import functools
 import itertools
 import math
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from common_scene import common_actions, common_scene
-from plab.bench.stability import (
-    ACTIONS,
-    COLUMNS,
-    StressCase,
-    StressPlan,
-    measure,
-    options_of,
-    summarise,
-)
-from plab.cli.command import Parser, command_line, to_write
+from plab.bench.stability import ACTIONS, COLUMNS, stress, stress_simulator, summarise
+from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table, write_csv
-from plab.config import build_scene, load_config
-from plab.config.suite import suite_tasks
-from plab.scenes import Body, Manipulator, Scene, SceneError, Vec3, vector3
+from plab.config import ConfigError, build_scene, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.scenes import PRECISIONS, Body, Manipulator, Scene, SceneError, Vec3, vector3
 
 STEP_TIME = 19e-4
 """Simulated time of an environment step of the suite [s]."""
@@ -49,6 +42,81 @@ DEFORMED = 512
 
 LABELLED = 12
 """Largest number of cases for which the figure of norms has a legend: colours repeat."""
+
+
+BATCH = 12
+"""Environments simulated together."""
+
+
+@dataclass(frozen=True)
+class StressPlan:
+    """Size of the matrix of cases.
+
+    Attributes:
+        particles: Particles per environment.
+        variants: Variants of each task.
+        long_tasks: Tasks simulated over the long horizon.
+        long_horizon: Environment steps of the long horizon.
+        horizon: Environment steps otherwise.
+    """
+
+    particles: int
+    variants: tuple[str, ...]
+    long_tasks: tuple[str, ...]
+    long_horizon: int
+    horizon: int = 50
+
+
+@dataclass(frozen=True)
+class StressCase:
+    """A scene and actions of a stress test.
+
+    Attributes:
+        family: Group of cases.
+        name: Name within the family.
+        scene: The scene.
+        actions: Actions, shape [T, A].
+        contact: Contact model.
+        state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
+        contact_weight: Weight of the loss's contact term.
+    """
+
+    family: str
+    name: str
+    scene: Scene
+    actions: np.ndarray
+    contact: str
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
+    contact_weight: float = 0.0
+
+
+def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
+    """Run cases in a precision, ``float32`` or ``float64``; those of one kind share a compiled simulator.
+    Yield a row of :data:`plab.bench.stability.COLUMNS` per case, and ``norms``."""
+    groups: dict[tuple, list[StressCase]] = defaultdict(list)
+    for case in cases:
+        scene, shapes = case.scene, tuple(m.shape for m in case.scene.manipulators)
+        kind = (shapes, scene.particle_count, scene.grid_size, scene.dt, scene.substeps)
+        groups[(*kind, len(case.actions), case.contact_weight)].append(case)
+    for group in groups.values():
+        size = min(BATCH, len(group))
+        simulator = stress_simulator([group[0].scene] * size, precision, group[0].contact_weight)
+        for at in range(0, len(group), size):
+            some = group[at : at + size]
+            full = [*some, *([some[-1]] * (size - len(some)))]
+            simulator.set_scenes([case.scene for case in full])
+            simulator.set_contact([case.contact for case in full])
+            start = simulator.state()
+            for e, case in enumerate(full):
+                for name, value in case.state.items():
+                    getattr(start, name)[e] = value
+            simulator.set_initial_state(start)
+            for case, found in zip(
+                some, stress(simulator, np.stack([c.actions for c in full])), strict=False
+            ):
+                yield {"precision": precision, "family": case.family, "case": case.name, **found}
+        # Release the memory of the simulator before building the next one.
+        del simulator
 
 
 def stress_cases(plan: StressPlan) -> list[StressCase]:
@@ -322,7 +390,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
     """Write, and draw, the norm of the gradient for each step back in time.
 
     Args:
-        rows: Rows of :func:`plab.bench.stability.run_cases`.
+        rows: Rows of :func:`run_cases`.
         path: CSV file; the drawing is a PNG of the same name.
     """
     from plab.report.figures import legend, single, style
@@ -358,8 +426,24 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--gradients", type=to_write, help="file for the gradient's norm per step back in time"
     )
-    options = options_of(parser, argv)
-    table = measure(options, stress_cases)
+    parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
+    parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
+    parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
+    parser.add_argument(
+        "--horizon", type=positive, default=1000, help="environment steps of long cases (1000)"
+    )
+    parser.add_argument("--family", nargs="+", help="families of cases")
+    parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
+    options = parser.parse_intermixed_args(argv)
+    variants, tasks = (SUITE_VARIANTS[:1], ("Move",)) if options.quick else (SUITE_VARIANTS, suite_tasks())
+    particles = options.particles or (64 if options.quick else 300)
+    cases = stress_cases(StressPlan(particles, variants, tuple(tasks), options.horizon))
+    families = list(dict.fromkeys(case.family for case in cases))
+    if unknown := set(options.family or ()) - set(families):
+        raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
+    chosen = [case for case in cases if case.family in (options.family or families)]
+    each = (run_cases(chosen, precision) for precision in options.precision)
+    table = measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv)
     if options.gradients is not None:
         write_norms(table, options.gradients)
     refused = [] if options.family else measure_table(COLUMNS, run_refusals(), None)

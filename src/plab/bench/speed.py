@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import gc
 import itertools
+import math
 import sys
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from plab.bench.workload import (
     FORWARD,
@@ -26,7 +28,7 @@ from plab.bench.workload import (
     time_calls,
 )
 from plab.cli.command import Parser, command_line, positive, task_list, to_write
-from plab.cli.tables import measure_table, write_markdown
+from plab.cli.tables import measure_table
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
 from plab.errors import tell
@@ -39,20 +41,12 @@ COLUMNS = (
 )  # fmt: skip
 
 PAPER_COLUMNS = (
-    "task", "device", "precision", "batch", "forward_ms", "forward_paper_ms", "forward_ratio", "gradient_ms",
-    "gradient_paper_ms", "gradient_ratio",
+    "task", "device", "precision", "batch", "forward_ms", "forward_paper_ms", "gradient_ms",
+    "gradient_paper_ms",
 )  # fmt: skip
 
 QUICK_KINDS = (FORWARD, GRADIENT)
-
-HEADING = """\
-# Time per environment step
-
-Milliseconds per environment step and environment, measured with `plab bench speed --paper`, beside
-what the PlasticineLab paper gives for a GTX 1080 Ti, and the paper's divided by ours. The forward pass
-includes loss and reward.
-
-"""
+PAPER_KINDS = (REWARD, GRADIENT)
 
 
 def rows(
@@ -101,29 +95,16 @@ def rows(
         }
 
 
-def paper_row(overrides: Sequence[str], batch: int, steps: int, repeats: int) -> dict[str, object]:
+def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, object]:
     """Return the milliseconds per environment step of one environment of a task, beside the paper's."""
-    gc.collect()
-    cfg = load_config(overrides)
     paper = paper_table("timing").set_index("task").loc[cfg.task.name]
-    show_line(f"{cfg.task.name} on {cfg.sim.device}")
-    load = build(cfg, batch, steps)
-    row: dict[str, object] = {
-        "task": cfg.task.name,
-        "device": cfg.sim.device,
-        "precision": cfg.sim.precision,
-        "batch": batch,
-    }
+    found: dict[Any, Any] = {row["what"]: row for row in rows(cfg, batch, steps, repeats, PAPER_KINDS)}
+    out = {name: next(iter(found.values()), {}).get(name) for name in PAPER_COLUMNS[:4]}
     columns = (("forward", REWARD, "forward_ms"), ("gradient", GRADIENT, "forward_backward_ms"))
     for name, kind, printed in columns:
-        ms = float(time_calls(load, kind, repeats)[1][0]) / batch
-        theirs = float(paper[printed])
-        row |= {
-            f"{name}_ms": round(ms, 2),
-            f"{name}_paper_ms": theirs,
-            f"{name}_ratio": round(theirs / ms, 1),
-        }
-    return row
+        ms = found[kind]["median_ms"] / batch if kind in found else math.nan
+        out |= {f"{name}_ms": round(ms, 2), f"{name}_paper_ms": float(paper[printed])}
+    return out
 
 
 @command_line
@@ -138,7 +119,6 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--repeats", type=positive, help="timed rollouts")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="kinds of calls to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     parser.add_argument("--paper", action="store_true", help="the paper's table beside ours")
     options = parser.parse_intermixed_args(argv)
@@ -154,14 +134,12 @@ def main(argv: Sequence[str]) -> int:
     ]
     # Widths of columns that differ from the default.
     widths = {"what": max(map(len, KINDS)), "task": 10, "device": 6, "batch": 5, "grid": 4}
+    cells = list(itertools.product(words, batches))
     if options.paper:
-        lines = (paper_row(own, batch, steps, repeats) for own in words for batch in batches)
-        table = measure_table(PAPER_COLUMNS, lines, options.csv, widths)
-        if options.markdown is not None:
-            write_markdown(options.markdown, HEADING, PAPER_COLUMNS, table)
+        lines = (paper_row(load_config(own), batch, steps, repeats) for own, batch in cells)
+        measure_table(PAPER_COLUMNS, lines, options.csv, widths)
         return 0
     kinds = options.kinds or (QUICK_KINDS if quick else tuple(KINDS))
-    cells = list(itertools.product(words, batches))
     parts = (rows(load_config(own), batch, steps, repeats, kinds) for own, batch in cells)
     table = measure_table(COLUMNS, itertools.chain.from_iterable(parts), options.csv, widths)
     return 0 if len(table) == len(cells) * len(kinds) else 1

@@ -13,13 +13,10 @@ are inside the domain, and the mass tensor contains all mass. The exit code is 1
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import cast
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -29,11 +26,8 @@ from plab.cli.tables import measure_table, print_table
 from plab.config import ConfigError, build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms
-from plab.scenes import PRECISIONS, Scene
+from plab.scenes import CONTACTS, PRECISIONS
 from plab.sim import Simulator, State
-
-BATCH = 12
-"""Environments simulated together."""
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
@@ -41,53 +35,10 @@ MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 HOLD = 10
 """Longest duration of a bang-bang action [environment steps]."""
 
+HORIZON = 50
+"""Environment steps of the suite's cases."""
+
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
-
-
-@dataclass(frozen=True)
-class StressPlan:
-    """Size of the matrix of cases.
-
-    Attributes:
-        particles: Particles per environment.
-        variants: Variants of each task.
-        long_tasks: Tasks simulated over the long horizon.
-        long_horizon: Environment steps of the long horizon.
-        horizon: Environment steps otherwise.
-    """
-
-    particles: int
-    variants: tuple[str, ...] = SUITE_VARIANTS
-    long_tasks: tuple[str, ...] = ()
-    long_horizon: int = 1000
-    horizon: int = 50
-
-
-FULL = StressPlan(particles=300, long_tasks=tuple(suite_tasks()))
-QUICK = StressPlan(particles=64, variants=("1",), long_tasks=("Move",))
-
-
-@dataclass(frozen=True)
-class StressCase:
-    """A scene and actions of a stress test.
-
-    Attributes:
-        family: Group of cases.
-        name: Name within the family.
-        scene: The scene.
-        actions: Actions, shape [T, A].
-        contact: Contact model.
-        state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
-        contact_weight: Weight of the loss's contact term.
-    """
-
-    family: str
-    name: str
-    scene: Scene
-    actions: np.ndarray
-    contact: str
-    state: Mapping[str, np.ndarray] = field(default_factory=dict)
-    contact_weight: float = 0.0
 
 
 def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
@@ -107,113 +58,91 @@ def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.nda
 ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
 
 
-def stress_cases(plan: StressPlan) -> Iterator[StressCase]:
-    """Yield the configurations of a plan under random and bang-bang actions, in both contact models."""
-    family = f"{plan.long_horizon} steps"
-    short = itertools.product(["suite"], suite_tasks(), plan.variants)
-    long = itertools.product([family], plan.long_tasks, ["1"])
-    number = 0
-    for family, task, variant in itertools.chain(short, long):
-        scene = build_scene(with_particles([f"task={task}", f"variant={variant}"], plan.particles))
-        steps = plan.horizon if family == "suite" else plan.long_horizon
-        for kind, contact in itertools.product(ACTIONS, ("soft", "hard")):
-            number += 1
-            actions = ACTIONS[kind](np.random.default_rng(number), steps, scene.action_dim)
-            name = f"{task}-v{variant} {kind} {contact}"
-            yield StressCase(family, name, scene, actions, contact, contact_weight=1.0)
+def rows(
+    families: Mapping[str, tuple[Sequence[str], Sequence[str], int]], particles: int, precision: str
+) -> Iterator[dict[str, object]]:
+    """Run the cases of some families, each of tasks, variants and environment steps, one task at a time;
+    yield a row of :data:`COLUMNS` per case."""
+    number = itertools.count(1)
+    for family, (tasks, variants, steps) in families.items():
+        for task in tasks:
+            cases = list(itertools.product(variants, ACTIONS, CONTACTS))
+            words = ([f"task={task}", f"variant={variant}"] for variant in variants)
+            scenes = [build_scene(with_particles(own, particles)) for own in words]
+            scenes = [scene for scene in scenes for _ in range(len(cases) // len(variants))]
+            rngs = (np.random.default_rng(next(number)) for _ in cases)
+            actions = [
+                ACTIONS[kind](rng, steps, scenes[0].action_dim)
+                for (_, kind, _), rng in zip(cases, rngs, strict=True)
+            ]
+            simulator = stress_simulator(scenes, precision, contact_weight=1.0)
+            simulator.set_contact([contact for *_, contact in cases])
+            for (variant, kind, contact), found in zip(
+                cases, stress(simulator, np.stack(actions)), strict=True
+            ):
+                name = f"{task}-v{variant} {kind} {contact}"
+                yield {"precision": precision, "family": family, "case": name, **found}
 
 
-def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
-    """Run and evaluate cases in a precision, ``float32`` or ``float64``.
-
-    Yields:
-        A row of :data:`COLUMNS` per case: outcome (``survived`` or the failure), fastest particle [cells per
-        substep], largest gradient component, and the environment step of that component; beyond the columns
-        ``norms``, those of the gradient with respect to each step's actions, shape [T].
-    """
-    for group in _groups(cases):
-        terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": group[0].contact_weight})
-        scenes = [group[0].scene] * min(BATCH, len(group))
-        simulator = Simulator(scenes, terms=terms, precision=precision)
-        simulator.set_target(*_target(simulator))
-        for at in range(0, len(group), simulator.batch):
-            yield from _run_together(simulator, group[at : at + simulator.batch])
-        # Release the memory of the simulator before building the next one.
-        del simulator
-
-
-def _groups(cases: Sequence[StressCase]) -> list[list[StressCase]]:
-    """Group the cases that can share a compiled simulator and a rollout."""
-    groups: dict[tuple, list[StressCase]] = defaultdict(list)
-    for case in cases:
-        scene, shapes = case.scene, tuple(m.shape for m in case.scene.manipulators)
-        kind = (shapes, scene.particle_count, scene.grid_size, scene.dt, scene.substeps)
-        groups[(*kind, len(case.actions), case.contact_weight)].append(case)
-    return list(groups.values())
-
-
-def _target(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Mass and distance of a ball in the middle, for all environments."""
+def stress_simulator(scenes: Sequence[Any], precision: str, contact_weight: float) -> Simulator:
+    """Return a simulator of some scenes whose target is a ball in the middle."""
+    terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": contact_weight})
+    simulator = Simulator(scenes, terms=terms, precision=precision)
     n = simulator.grid_size
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(nodes - (0.5, 0.3, 0.5), axis=-1) - 0.15
-    mass = np.where(distance < 0.0, simulator.scenes[0].particle_mass, 0.0)
+    mass = np.where(distance < 0.0, scenes[0].particle_mass, 0.0)
     shape = (simulator.batch, n, n, n)
-    return np.broadcast_to(mass, shape), np.broadcast_to(np.maximum(distance, 0.0), shape)
+    simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(np.maximum(distance, 0.0), shape))
+    return simulator
 
 
-def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> Iterator[dict[str, object]]:
-    """Run up to a batch of cases of one group."""
-    full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
-    simulator.set_scenes([case.scene for case in full])
-    simulator.set_contact([case.contact for case in full])
-    start = simulator.state()
-    for e, case in enumerate(full):
-        for name, value in case.state.items():
-            getattr(start, name)[e] = value
-    simulator.set_initial_state(start)
-    actions = np.stack([case.actions for case in full])
-    rollout = simulator.rollout(actions, strict=False)
+def stress(simulator: Simulator, actions: np.ndarray) -> Iterator[dict[str, Any]]:
+    """Simulate actions, shape [batch, T, A], forwards and backwards.
+
+    Yields:
+        Of each environment: outcome (``survived`` or the failure), speed of the fastest particle [cells per
+        substep], largest gradient component, the environment step of that component, and ``norms`` of the
+        gradient with respect to each step's actions, shape [T].
+    """
+    rollout: Any = simulator.rollout(actions, strict=False)
     state, mass = simulator.state(), simulator.mass_tensor()
     fastest = np.zeros(simulator.batch)
     simulator.reset()
     for t in range(actions.shape[1]):
         simulator.step(actions[:, t], check=False)
         fastest = np.maximum(fastest, np.linalg.norm(simulator.observe(1)[:, :, 3:], axis=2).max(axis=1))
-    for e, case in enumerate(cases):
-        gradient = cast(np.ndarray, rollout.gradient)[e]
-        sizes = np.abs(gradient).max(axis=1, initial=0.0)
-        speed = fastest[e] * case.scene.dt / case.scene.dx
+    for e, scene in enumerate(simulator.scenes):
+        sizes = np.abs(rollout.gradient[e]).max(axis=1, initial=0.0)
+        speed = fastest[e] * scene.dt / scene.dx
         yield {
-            "precision": simulator.precision,
-            "family": case.family,
-            "case": case.name,
-            "outcome": rollout.failures.get(e) or _outcome(simulator.precision, case, e, state, mass, speed),
+            "outcome": rollout.failures.get(e) or _outcome(simulator, e, state, mass, speed),
             "speed": f"{speed:.3f}",
             "gradient": f"{sizes.max():.3g}",
             "where": int(sizes.argmax()) + 1,
-            "norms": np.linalg.norm(gradient, axis=1),
+            "norms": np.linalg.norm(rollout.gradient[e], axis=1),
         }
 
 
-def _outcome(precision: str, case: StressCase, e: int, state: State, mass: np.ndarray, speed: float) -> str:
+def _outcome(simulator: Simulator, e: int, state: State, mass: np.ndarray, speed: float) -> str:
     """Evaluate the last state of environment e, its mass tensor and its speed [cells per substep]."""
+    scene = simulator.scenes[e]
     if not all(np.isfinite(getattr(state, name)[e]).all() for name in ("x", "v", "C", "F", "poses")):
         return "the last state is not finite"
-    if state.x[e].min() < 0.0 or state.x[e].max() > 1.0 - 2.999 * case.scene.dx:
+    if state.x[e].min() < 0.0 or state.x[e].max() > 1.0 - 2.999 * scene.dx:
         return "a particle left the domain"
-    error = abs(mass[e].sum() / (case.scene.particle_mass * case.scene.particle_count) - 1.0)
+    error = abs(mass[e].sum() / (scene.particle_mass * scene.particle_count) - 1.0)
     # NaN must fail these comparisons, too.
-    if not error <= MASS_TOLERANCE[precision]:
+    if not error <= MASS_TOLERANCE[simulator.precision]:
         return f"mass changed by {error:.1e} of itself"
     return "survived" if speed <= 1.0 else "a particle crossed a cell in a substep"
 
 
-def summarise(rows: Sequence[Mapping[str, object]]) -> int:
+def summarise(rows: Iterable[Mapping[str, object]]) -> int:
     """Print the number of passed cases per family; return the exit code."""
-    survived: dict[tuple, list[bool]] = defaultdict(list)
+    survived: dict[tuple, list[bool]] = {}
     for row in rows:
-        survived[row["precision"], row["family"]].append(row["outcome"] == "survived")
+        survived.setdefault((row["precision"], row["family"]), []).append(row["outcome"] == "survived")
     every = [one for own in survived.values() for one in own]
     counts = [(*which, len(own), sum(own)) for which, own in survived.items()]
     print()
@@ -225,36 +154,26 @@ def summarise(rows: Sequence[Mapping[str, object]]) -> int:
 @command_line
 def main(argv: Sequence[str]) -> int:
     """Simulate the cases, print, write the requested file; return the exit code."""
-    options = options_of(Parser("plab bench stability", __doc__), argv)
-    return summarise(measure(options, stress_cases))
-
-
-def options_of(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
-    """Parse the options of a command that runs cases, in addition to those of the parser."""
+    parser = Parser("plab bench stability", __doc__)
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
     parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
-    parser.add_argument("--horizon", type=positive, help="environment steps of the long horizon (1000)")
+    text = "environment steps of the long horizon (1000)"
+    parser.add_argument("--horizon", type=positive, default=1000, help=text)
     parser.add_argument("--family", nargs="+", help="families of cases")
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     options = parser.parse_intermixed_args(argv)
-    plan = QUICK if options.quick else FULL
-    plan = replace(plan, particles=options.particles or plan.particles)
-    options.plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
-    return options
-
-
-def measure(
-    options: argparse.Namespace, cases_of: Callable[[StressPlan], Iterable[StressCase]]
-) -> list[Mapping[str, object]]:
-    """Run and print the cases selected by the options of :func:`options_of`; return the rows."""
-    cases = list(cases_of(options.plan))
-    families = list(dict.fromkeys(case.family for case in cases))
+    quick, tasks = options.quick, suite_tasks()
+    families = {
+        "suite": (tasks, SUITE_VARIANTS[:1] if quick else SUITE_VARIANTS, HORIZON),
+        f"{options.horizon} steps": (["Move"] if quick else tasks, ["1"], options.horizon),
+    }
     if unknown := set(options.family or ()) - set(families):
         raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
-    chosen = [case for case in cases if case.family in (options.family or families)]
-    each = (run_cases(chosen, precision) for precision in options.precision)
-    return measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv)
+    chosen = {name: cases for name, cases in families.items() if name in (options.family or families)}
+    particles = options.particles or (64 if quick else 300)
+    each = (rows(chosen, particles, precision) for precision in options.precision)
+    return summarise(measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv))
 
 
 if __name__ == "__main__":

@@ -106,13 +106,3 @@ def _text(value: Any, digits: int) -> str:
     if value is None or value != value:
         return ""
     return f"{value:.{digits}g}" if isinstance(value, float) else " ".join(str(value).split())
-
-
-def write_markdown(
-    path: Path, heading: str, columns: Sequence[str], rows: Iterable[Mapping[str, object]]
-) -> None:
-    """Write a heading and a table in Markdown, without rounding numbers, creating the folder if necessary."""
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(str(row[name]) for name in columns) + " |" for row in rows]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(heading + "\n".join(lines) + "\n", encoding="utf-8")

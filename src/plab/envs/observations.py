@@ -205,7 +205,7 @@ class Sensors:
 
     def release(self) -> None:
         """Let go of the simulator and its memory."""
-        self._sources, self._cameras = {}, {}
+        self._sources, self._cameras = dict.fromkeys({"state"} & self._sources.keys()), {}
 
     def refresh(self) -> None:
         """Follow a change of the simulator's scenes."""
