@@ -19,6 +19,7 @@ mass tensor.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -46,9 +47,11 @@ STEP_TIME = 19e-4
 ACTION_SCALE = 0.7
 """Factor on the demonstration's actions."""
 
+ERRORS = ("positions", "mass", "score", "gradient", "angle_deg")
+
 COLUMNS = (
     "axis", "task", "contact", "precision", "material", "grid", "particles", "substeps", "ms_per_step",
-    "positions", "mass", "score", "gradient", "angle_deg", "outcome",
+    *ERRORS, "outcome",
 )  # fmt: skip
 
 
@@ -58,7 +61,7 @@ class UncheckedScene(Scene):
     @property
     def stable_dt(self) -> float:
         """No limit."""
-        return float("inf")
+        return math.inf
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,8 @@ class Plan:
         grids: Grids, the finest last; it is the reference.
         steps: Environment steps.
         particles: Particles at ``grid``.
-        repeats: Timed rollouts.
+        repeats: Timed rollouts after the first, which compiles; the fastest counts.
+        device: ``cpu`` or ``cuda``.
     """
 
     grid: int = 64
@@ -105,23 +109,22 @@ class Plan:
     repeats: int = 2
     device: str = "cpu"
 
+    def of_grid(self, grid: int) -> Resolution:
+        """The suite's number of substeps per cell width."""
+        return Resolution("grid", grid, round(self.usual * grid / self.grid))
+
     def settings(self) -> list[Resolution]:
         """All settings except the references."""
         out = [Resolution("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
         out += [Resolution("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
-        return out + [Resolution("grid", n, self._substeps_of(n)) for n in self.grids[:-1]]
+        return out + [self.of_grid(n) for n in self.grids[:-1]]
 
     def references(self) -> dict[str, Resolution]:
         """Reference by axis."""
-        finest = self.grids[-1]
         return {
             "substeps": Resolution("substeps", self.grid, self.reference),
-            "grid": Resolution("grid", finest, self._substeps_of(finest)),
+            "grid": self.of_grid(self.grids[-1]),
         }
-
-    def _substeps_of(self, grid: int) -> int:
-        """The suite's number of substeps per cell width."""
-        return round(self.usual * grid / self.grid)
 
 
 QUICK = Plan(32, (3, 5, 10, 20), 10, reference=80, grids=(24, 32, 40), steps=20, particles=1000, repeats=1)
@@ -151,15 +154,8 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
-    """Particles on a regular lattice inside each body.
-
-    Args:
-        bodies: The bodies.
-        spacing: Distance of neighbours [domain units].
-
-    Returns:
-        Positions for each body, each [particle, 3].
-    """
+    """Return particles on a regular lattice inside each body, shape [particle, 3] each; neighbours have a
+    distance of ``spacing`` [domain units]."""
     out = []
     for body in bodies:
         half = body.half_extent()
@@ -204,16 +200,8 @@ class Attempt:
         return UncheckedScene(**values | {"dt": STEP_TIME / setting.substeps}), x
 
     def run(self, setting: Resolution, repeats: int) -> dict[str, Result]:
-        """Simulate and time one setting.
-
-        Args:
-            setting: The setting. The first setting of an axis determines the target, as the final state of
-                the demonstration.
-            repeats: Number of rollouts after the first, which compiles; the fastest counts.
-
-        Returns:
-            A result per contact model.
-        """
+        """Simulate and time one setting, and return a result per contact model. The first setting of an axis
+        determines the target, as the final state of the demonstration."""
         scene, x = self.start(setting)
         simulator = Simulator(
             [scene],
@@ -248,11 +236,10 @@ class Attempt:
     def errors(self, setting: Resolution, result: Result, exact: Result, grid: int) -> dict[str, float]:
         """Return the errors of a result by column, NaN if not applicable; mass tensors are compared on
         ``grid`` nodes per axis."""
-        end = self.ends[setting.axis]
-        errors = dict.fromkeys(("positions", "mass", "score", "gradient", "angle_deg"), float("nan"))
+        errors = dict.fromkeys(ERRORS, math.nan)
         if result.outcome != "stable":
             return errors
-        positions = (self.start(setting)[1], result.x, exact.x, end)
+        positions = (self.start(setting)[1], result.x, exact.x, self.ends[setting.axis])
         initial, found, right, target = (spread_mass(x, grid, 1.0 / len(x)) for x in positions)
         if setting.axis == "substeps":
             errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
@@ -268,7 +255,7 @@ class Attempt:
 
 
 def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
-    """Run a plan; yields a row of :data:`COLUMNS` per task, setting and contact model."""
+    """Run a plan; yield a row of :data:`COLUMNS` per task, setting and contact model."""
     grids = {"substeps": plan.grid, "grid": plan.grids[0]}
     for task in tasks:
         attempt = Attempt(task, plan)

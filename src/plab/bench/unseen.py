@@ -52,15 +52,8 @@ def rows(
     words: Sequence[str],
     observe: str | Sequence[str],
 ) -> Iterator[dict[str, object]]:
-    """Measure policies, one after the other.
-
-    Args:
-        policies: By name: policy, overrides of its configuration, and training scenes.
-        count: Scenes.
-        together: Scenes simulated at a time.
-        words: Further overrides.
-        observe: Observations, see :class:`plab.envs.core.EpisodeBatch`.
-    """
+    """Measure policies, given by name with overrides of their configurations and training scenes, in
+    ``count`` scenes, ``together`` at a time. ``words`` are further overrides."""
     # Imported here, because SciPy would slow down every `--help`.
     from scipy import stats
 

@@ -61,21 +61,11 @@ def with_particles(overrides: Sequence[str], particles: int) -> Config:
 
 
 def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> Workload:
-    """Build a simulator in a state with contact.
+    """Build a simulator of a batch of environments in a state with contact.
 
     The target is the shifted initial shape, because generating the task's own target takes time without
-    affecting the measurement.
-
-    Args:
-        cfg: The configuration.
-        batch: Number of environments.
-        steps: Environment steps of a rollout.
-        from_start: Start from the scene's initial state instead of the middle of the best known actions.
-
-    Raises:
-        plab.scenes.SceneError: If the scene cannot be simulated.
-        plab.targets.TargetError: If the target, from which the best actions are derived, is invalid.
-        plab.sim.DeviceError: If CUDA is not available.
+    affecting the measurement. A rollout has ``steps`` environment steps; it starts in the middle of the best
+    known actions, or with ``from_start`` in the scene's initial state.
     """
     simulator = make_simulator([cfg] * batch)
     scene = simulator.scenes[0]
@@ -93,28 +83,22 @@ def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> W
     if not from_start:
         first = max(0, actions.shape[1] // 2 - steps // 2)
         _run(simulator, actions[:, :first])
-        idle = _before_contact(simulator, actions[:, first:])
-        _run(simulator, actions[:, first : first + idle])
-        first += idle
         simulator.set_initial_state(simulator.state())
+        idle = _run(simulator, actions[:, first:], until_contact=True)
+        _run(simulator, actions[:, first : first + idle])
+        simulator.set_initial_state(simulator.state())
+        first += idle
     chosen = np.arange(first, first + steps) % actions.shape[1]
     return Workload(cfg, simulator, actions[:, chosen], first_step_s)
 
 
-def _run(simulator: Simulator, actions: np.ndarray) -> None:
+def _run(simulator: Simulator, actions: np.ndarray, *, until_contact: bool = False) -> int:
+    """Simulate actions, shape [batch, T, A], from the initial state; return the number of steps before the
+    first contact, which ends ``until_contact``, or 0."""
     simulator.reset()
     for t in range(actions.shape[1]):
         simulator.step(actions[:, t])
-
-
-def _before_contact(simulator: Simulator, actions: np.ndarray) -> int:
-    """Make the current state the initial state, and return the number of steps of actions, shape [batch, T,
-    A], before the first contact; 0 without contact."""
-    simulator.set_initial_state(simulator.state())
-    simulator.reset()
-    for t in range(actions.shape[1]):
-        simulator.step(actions[:, t])
-        if simulator.steps_before_contact(1) == 0:
+        if until_contact and simulator.steps_before_contact(1) == 0:
             return t
     return 0
 
