@@ -35,13 +35,7 @@ RECIPES: Mapping[str, type[Recipe]] = Registry(
 
 
 def make_recipe(target: Mapping[str, Any]) -> Recipe:
-    """Convert the section ``target`` of a task to its recipe.
-
-    Args:
-        target: ``recipe`` and the recipe's parameters.
-
-    Returns:
-        The recipe, with all its fields set and of the right type.
+    """Convert the section ``target`` of a task, ``recipe`` and its parameters, to the recipe.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist, is missing or has a wrong type.
@@ -67,12 +61,8 @@ def _made(pickled: bytes) -> Recipe:
 
 
 def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the actions of a scripted target, in [-1, 1], shape [EPISODE_STEPS, A]; None for a target
-    without simulation.
-
-    Raises:
-        TargetError: If the recipe or a parameter does not exist or has a wrong value.
-    """
+    """Return the actions of a scripted target, in [-1, 1], shape [EPISODE_STEPS, A], or None for a target
+    without simulation; TargetError if a parameter has a wrong value."""
     recipe: Any = make_recipe(target)
     return None if isinstance(recipe, TensorRecipe) else recipe.actions(scene)
 
@@ -88,32 +78,22 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
     """Return the mass tensor of a target without simulation, shape [n, n, n], float64.
 
     Raises:
-        TargetError: If the recipe or a parameter does not exist or has a wrong value, the shape leaves the
-            domain, or the target has to be simulated.
+        TargetError: If a parameter has a wrong value, the shape leaves the domain, or the target has to be
+            simulated.
     """
     recipe = make_recipe(target)
     if not isinstance(recipe, TensorRecipe):
-        raise TargetError(
-            f"target.recipe {target['recipe']} is simulated: build it with plab.problem.Problem"
-        )
+        raise TargetError(f"target.recipe {target['recipe']} is simulated, by plab.problem.Problem")
     return recipe.mass(scene)
 
 
 def build_targets(
     simulator: Simulator, targets: Sequence[Mapping[str, Any]], *, rebuild: bool = False
 ) -> np.ndarray:
-    """Build the targets of a simulator's environments, simulating scripted ones.
+    """Build the targets of a simulator's environments, simulating scripted ones that are not cached on disk
+    (with ``rebuild`` all); return the mass tensors, shape [batch, n, n, n], float64.
 
-    Simulated targets are cached on disk. The simulator is left in its initial state, in the hard contact
-    model if targets were simulated.
-
-    Args:
-        simulator: Simulator of the scenes that the targets belong to.
-        targets: ``recipe`` and the recipe's parameters, one per environment.
-        rebuild: Simulate also cached targets.
-
-    Returns:
-        Mass tensors, shape [batch, n, n, n], float64.
+    The simulator is left in its initial state, in the hard contact model if targets were simulated.
 
     Raises:
         TargetError: See :func:`build_target`.
@@ -123,15 +103,14 @@ def build_targets(
     scenes = [_target_scene(scene, make_recipe(target)) for scene, target in zip(own, targets, strict=True)]
     # Vectorised environments are often equal, so each kind is built once.
     kinds = [(scene, id(target)) for scene, target in zip(scenes, targets, strict=True)]
-    masses: dict[tuple[Scene, int], np.ndarray] = {}
+    masses: dict[tuple[Scene, int], np.ndarray | None] = {}
     missing: dict[tuple[Scene, int], np.ndarray] = {}
     for kind, target in dict(zip(kinds, targets, strict=True)).items():
-        script = demonstration(kind[0], target)
-        if script is None:
+        if (script := demonstration(kind[0], target)) is None:
             masses[kind] = build_target(kind[0], target)
-        elif (kept := None if rebuild else store.load(kind[0], script)) is not None:
-            masses[kind] = kept
-        else:
+            continue
+        masses[kind] = None if rebuild else store.load(kind[0], script)
+        if masses[kind] is None:
             missing[kind] = script
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
@@ -143,9 +122,9 @@ def build_targets(
         made = simulator.mass_tensor()
         simulator.set_scenes(own) if changed else simulator.reset()
         for kind, script in missing.items():
-            masses[kind] = made[kinds.index(kind)]
-            store.save(kind[0], script, masses[kind])
-    return np.stack([masses[kind] for kind in kinds])
+            masses[kind] = mass = made[kinds.index(kind)]
+            store.save(kind[0], script, mass)
+    return np.stack([cast(np.ndarray, masses[kind]) for kind in kinds])
 
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,6 +33,15 @@ class TargetError(PlabError, ValueError):
     """A target cannot be built; the message has the reason."""
 
 
+@contextmanager
+def _located(place: str) -> Iterator[None]:
+    """Add the place to errors of scenes and files."""
+    try:
+        yield
+    except (SceneError, ShapeError) as error:
+        raise TargetError(f"{place}: {error}") from None
+
+
 class Recipe:
     """A target recipe; subclasses are dataclasses with the keys of the section ``target`` as fields."""
 
@@ -40,11 +51,8 @@ class TensorRecipe(Recipe, ABC):
 
     @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
-        """Return the mass tensor of a scene's target, shape [n, n, n], float64; its mass is the scene's.
-
-        Raises:
-            TargetError: If a parameter has a wrong value, or the shape leaves the domain.
-        """
+        """Return the mass tensor of a scene's target, shape [n, n, n], float64, with the scene's total mass;
+        TargetError if a parameter has a wrong value, or the shape leaves the domain."""
 
 
 class PointsRecipe(TensorRecipe):
@@ -111,10 +119,8 @@ class BodiesTarget(PointsRecipe):
         for name, body in self.bodies.items():
             if len(body.center) != 3:
                 raise TargetError(f"target.bodies.{name}.center must be 3 numbers, not {body.center}")
-            try:
+            with _located(f"target.bodies.{name}"):
                 solids.append(body.build(1))
-            except (SceneError, ShapeError) as error:
-                raise TargetError(f"target.bodies.{name}: {error}") from None
         volumes = np.array([solid.volume for solid in solids])
         if not np.all(volumes > 0):
             raise TargetError("target.bodies: sizes must be positive")
@@ -123,10 +129,8 @@ class BodiesTarget(PointsRecipe):
         counts = np.diff(ends, prepend=0)
         bodies = tuple(replace(solid, particles=int(n)) for solid, n in zip(solids, counts, strict=True))
         filled = replace(scene, bodies=bodies, particle_seed=int(rng.integers(2**31)))
-        try:
+        with _located("target"):
             filled.validate()
-        except SceneError as error:
-            raise TargetError(f"target.{error}") from None
         return sample_particles(filled)
 
 
@@ -147,15 +151,11 @@ class RingTarget(PointsRecipe):
     floor: float
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        if not 0 <= self.around < len(scene.manipulators):
-            raise TargetError(
-                f"target.around {self.around} is not the index of a manipulator, 0 .. "
-                f"{len(scene.manipulators) - 1}"
-            )
-        if not 0 < self.section < 2 * self.radius:
-            raise TargetError(
-                f"target.section {self.section:g} must be between 0 and twice the radius {self.radius:g}"
-            )
+        last, wide = len(scene.manipulators) - 1, 2 * self.radius
+        if not 0 <= self.around <= last:
+            raise TargetError(f"target.around {self.around} must be the index of a manipulator, 0 .. {last}")
+        if not 0 < self.section < wide:
+            raise TargetError(f"target.section {self.section:g} must be in (0, {wide:g}), twice the radius")
         inner, outer = self.radius - self.section / 2, self.radius + self.section / 2
         unit = rng.random((scene.particle_count, 3))
         # Uniform in the area of the annulus, not in its radius.
@@ -202,17 +202,15 @@ class PointsTarget(PointsRecipe):
         # Imported here, because SciPy would slow down every `--help`.
         from scipy.spatial import KDTree
 
-        try:
+        with _located("target"):
             points = read_points(*pinned(self.file, self.sha256))
-        except ShapeError as error:
-            raise TargetError(f"target: {error}") from None
         some = points[:: -(-len(points) // _MEASURED)]
         distance = float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
         # Points farther apart would be isolated dots on the grid.
         if distance > scene.dx:
             raise TargetError(
-                f"target: half of the points of {self.file} have no other within {distance:.2g}, more than a "
-                f"cell of the grid, {scene.dx:.2g}: give more points, or a coarser grid"
+                f"target: half of the points of {self.file} are {distance:.2g} or more apart, above a cell, "
+                f"{scene.dx:.2g}: give more points, or a coarser grid"
             )
         cells, enclosed = _filled(points, scene.grid_size)
         if self.fill:
@@ -254,10 +252,8 @@ class MassTarget(TensorRecipe):
     sha256: str | None = None
 
     def mass(self, scene: Scene) -> np.ndarray:
-        try:
+        with _located("target"):
             mass = _read_tensor(*pinned(self.file, self.sha256))
-        except ShapeError as error:
-            raise TargetError(f"target: {error}") from None
         n = scene.grid_size
         if mass.shape != (n, n, n):
             raise TargetError(f"target: {self.file} has shape {list(mass.shape)}, but the grid has {[n] * 3}")
@@ -266,14 +262,8 @@ class MassTarget(TensorRecipe):
 
 @lru_cache(maxsize=8)
 def read_points(file: str, _sha256: str = "") -> np.ndarray:
-    """Read a point cloud from a NumPy, PLY or XYZ file, cached by content.
-
-    Returns:
-        Positions, shape [point, 3], float64, finite.
-
-    Raises:
-        plab.files.ShapeError: If the file cannot be read, or holds no points.
-    """
+    """Return the positions in a NumPy, PLY or XYZ file, shape [point, 3], float64, cached by content;
+    ShapeError if the file cannot be read, or holds no points."""
     kind = Path(file).suffix.lower()
     if kind == ".ply":
         from plab.scenes.mesh import read_mesh

@@ -8,7 +8,6 @@ with a known solution.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -33,10 +32,11 @@ class _TooLong(Exception):
 
 
 class ActionTrack:
-    """Actions of one manipulator, built from a sequence of motions."""
+    """Actions of one manipulator, ``tool``, built from a sequence of motions."""
 
     def __init__(self, manipulator: Manipulator) -> None:
         """Start at the manipulator's position without steps."""
+        self.tool = manipulator
         self._scale = np.asarray(manipulator.scale)
         self._actions: list[np.ndarray] = []
 
@@ -75,7 +75,7 @@ class ActionTrack:
 
 
 @dataclass
-class Script(Recipe, ABC):
+class Script(Recipe):
     """A scripted demonstration.
 
     Attributes:
@@ -98,50 +98,37 @@ class Script(Recipe, ABC):
         values = {key: getattr(self, key) for key in MATERIAL_KEYS}
         return {key: value for key, value in values.items() if value is not None}
 
-    @abstractmethod
     def actions(self, scene: Scene) -> np.ndarray:
-        """Draw the demonstration's actions.
-
-        Args:
-            scene: The scene.
-
-        Returns:
-            Actions in [-1, 1], shape [EPISODE_STEPS, A].
+        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A].
 
         Raises:
             TargetError: If a parameter has a wrong value, or no sampled path fits into an episode.
         """
-
-
-@dataclass
-class PlannedScript(Script):
-    """A demonstration with one sampled path per manipulator."""
-
-    def actions(self, scene: Scene) -> np.ndarray:
-        """See :meth:`Script.actions`."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
-        if not any(m.action_dim for m in scene.tools):
-            raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
-        rng = np.random.default_rng(self.seed)
+        rng, movers = np.random.default_rng(self.seed), [m for m in scene.tools if m.action_dim]
         for _ in range(DRAWS):
-            tracks = [ActionTrack(m) for m in scene.tools if m.action_dim]
             try:
-                self.plan(scene, tracks, rng)
-                return np.concatenate([track.actions() for track in tracks], axis=1)
+                return self.sample(scene, [ActionTrack(m) for m in movers], rng)
             except _TooLong:
                 continue
         raise TargetError(
             f"the script does not fit into {EPISODE_STEPS} steps: make its ranges smaller or the scale larger"
         )
 
-    @abstractmethod
+    def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
+        """Draw actions once; _TooLong if they do not fit into an episode."""
+        if not tracks:
+            raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
+        self.plan(scene, tracks, rng)
+        return np.concatenate([track.actions() for track in tracks], axis=1)
+
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """Sample one path for each moving manipulator."""
+        """Draw one path for each moving manipulator."""
 
 
 @dataclass
-class PressTarget(PlannedScript):
+class PressTarget(Script):
     """A manipulator descends onto the first body, off its centre, and rises again.
 
     Attributes:
@@ -153,7 +140,7 @@ class PressTarget(PlannedScript):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        tool, (track, *_) = _mover(scene), tracks
+        track, tool = tracks[0], tracks[0].tool
         offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
         x, z = offset * rng.choice([-1.0, 1.0], size=2)
         depth = _draw(rng, "depth", self.depth)
@@ -164,7 +151,7 @@ class PressTarget(PlannedScript):
 
 
 @dataclass
-class DrawTarget(PlannedScript):
+class DrawTarget(Script):
     """A pen draws connected straight strokes on the first body's top, and is lifted.
 
     Attributes:
@@ -180,7 +167,7 @@ class DrawTarget(PlannedScript):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        tool, (track, *_) = _mover(scene), tracks
+        track, tool = tracks[0], tracks[0].tool
         body = scene.bodies[0]
         depth = _draw(rng, "depth", self.depth)
         track.go([0.0, _top(body) - depth - (tool.position[1] - _below(tool)), 0.0])
@@ -203,7 +190,7 @@ class DrawTarget(PlannedScript):
 
 
 @dataclass
-class DentTarget(PlannedScript):
+class DentTarget(Script):
     """A sphere pushes dents into the first body, each towards its centre.
 
     Attributes:
@@ -219,7 +206,7 @@ class DentTarget(PlannedScript):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        tool, (track, *_) = _mover(scene), tracks
+        track, tool = tracks[0], tracks[0].tool
         body = scene.bodies[0]
         centre, half = np.asarray(body.center), body.half_extent()
         radius = tool.size[0]
@@ -241,7 +228,7 @@ class DentTarget(PlannedScript):
 
 
 @dataclass
-class RollTarget(PlannedScript):
+class RollTarget(Script):
     """A rolling pin moves back and forth over the first body while descending.
 
     Attributes:
@@ -255,7 +242,7 @@ class RollTarget(PlannedScript):
     yaw: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        tool, (track, *_) = _mover(scene), tracks
+        track, tool = tracks[0], tracks[0].tool
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
         angle = _draw(rng, "reach", self.reach) / ROLL_RADIUS
         side = rng.choice([-1.0, 1.0])
@@ -268,7 +255,7 @@ class RollTarget(PlannedScript):
 
 
 @dataclass
-class LiftTarget(PlannedScript):
+class LiftTarget(Script):
     """Chopsticks lift the first body, move it sideways and rotate it, so that its ends hang and trail.
 
     Attributes:
@@ -284,7 +271,7 @@ class LiftTarget(PlannedScript):
     z: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        (track, *_) = tracks
+        track = tracks[0]
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
         turn, x = _draw(rng, "turn", self.turn), _draw(rng, "x", self.x)
         sides = rng.choice([-1.0, 1.0], size=2)
@@ -295,7 +282,7 @@ class LiftTarget(PlannedScript):
 
 
 @dataclass
-class CarryTarget(PlannedScript):
+class CarryTarget(Script):
     """Two spheres grip the last body, set it on the first and release it.
 
     Attributes:
@@ -308,7 +295,7 @@ class CarryTarget(PlannedScript):
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         base, cargo = scene.bodies[0], scene.bodies[-1]
-        tools = [m for m in scene.tools if m.action_dim]
+        tools = [track.tool for track in tracks]
         squeeze, press = _draw(rng, "squeeze", self.squeeze), _draw(rng, "press", self.press)
         x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
         rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
@@ -317,17 +304,17 @@ class CarryTarget(PlannedScript):
         lowest = min(tool.position[1] - tool.size[0] for tool in tools)
         edge = abs(x) - base.half_extent()[0] - lead
         beside = math.copysign(edge * rise / (_top(base) - lowest), x)
-        for track, tool in zip(tracks, tools, strict=True):
-            inwards = math.copysign(1.0, cargo.center[0] - tool.position[0])
+        for track in tracks:
+            inwards = math.copysign(1.0, cargo.center[0] - track.tool.position[0])
             track.go([inwards * squeeze, 0.0, 0.0], 2)
             track.go([beside, rise, 0.0])
             track.go([x - beside, 0.0, z])
             track.go([0.0, -CLEARANCE - press, 0.0])
-            track.go([-inwards * tool.scale[0] * 3, 0.0, 0.0])
+            track.go([-inwards * track.tool.scale[0] * 3, 0.0, 0.0])
 
 
 @dataclass
-class PushTarget(PlannedScript):
+class PushTarget(Script):
     """A sphere between the legs of a table pushes one of them outwards, at the end of the episode: the rest
     of the table stays where it is.
 
@@ -344,7 +331,7 @@ class PushTarget(PlannedScript):
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         if not 0 < self.legs <= len(scene.bodies):
             raise TargetError(f"target.legs must be in 1 .. {len(scene.bodies)}, not {self.legs}")
-        tool, (track, *_) = _mover(scene), tracks
+        track, tool = tracks[0], tracks[0].tool
         leg = scene.bodies[rng.integers(self.legs)]
         way = (np.asarray(leg.center) - np.asarray(tool.position)) * [1.0, 0.0, 1.0]
         length = float(np.linalg.norm(way))
@@ -380,19 +367,17 @@ class GestureTarget(Script):
 
     postures: list[Posture]
 
-    def actions(self, scene: Scene) -> np.ndarray:
-        """See :meth:`Script.actions`."""
+    def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
+        """See :meth:`Script.sample`."""
         # Imported here: few tasks have an articulated model.
         from plab.kinematics.chain import ModelError, matched
 
         chain = scene.kinematics
-        if self.seed < 0 or chain is None:
-            reason = "the recipe needs a task with kinematics" if chain is None else "seed must be at least 0"
-            raise TargetError(f"target: {reason}")
-        rng = np.random.default_rng(self.seed)
+        if chain is None:
+            raise TargetError("target: the recipe needs a task with kinematics")
         joints = {joint.name: joint for joint in chain.joints}
         at = {name: joint.start for name, joint in joints.items()}
-        rows: list[np.ndarray] = []
+        rows = np.zeros((0, scene.action_dim))
         for number, posture in enumerate(self.postures):
             goal: dict[str, float] = {}
             for pattern, limits in posture.joints.items():
@@ -402,13 +387,12 @@ class GestureTarget(Script):
                 except ModelError as error:
                     raise TargetError(str(error)) from None
             shares = {name: (to - at[name]) / joints[name].scale for name, to in goal.items()}
-            most = max(map(abs, shares.values()), default=0.0)
-            steps = max(posture.steps, math.ceil(most - 1e-9))
+            steps = max(posture.steps, math.ceil(max(map(abs, shares.values()), default=0.0) - 1e-9))
             row = np.zeros(scene.action_dim)
             for name, share in shares.items():
                 row[joints[name].component - len(chain.components)] = share / steps
             row = np.round(row, DECIMALS)
-            rows += [row] * steps
+            rows = np.concatenate([rows, np.tile(row, (steps, 1))])
             for name, joint in joints.items():
                 moved = at[name] + steps * joint.scale * row[joint.component - len(chain.components)]
                 at[name] = min(max(moved, joint.low), joint.high)
@@ -416,9 +400,7 @@ class GestureTarget(Script):
             raise TargetError(
                 f"the gesture takes {len(rows)} steps, not at most {EPISODE_STEPS}: shorten its ways"
             )
-        actions = np.zeros((EPISODE_STEPS, scene.action_dim))
-        actions[: len(rows)] = np.reshape(rows, (len(rows), -1))
-        return actions
+        return np.pad(rows, ((0, EPISODE_STEPS - len(rows)), (0, 0)))
 
 
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
@@ -433,10 +415,6 @@ def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
     if len(limits) != 2 or not 1 <= limits[0] <= limits[1]:
         raise TargetError(f"target.{name} must be a range [low, high] from 1 on, not {list(limits)}")
     return int(rng.integers(limits[0], limits[1] + 1))
-
-
-def _mover(scene: Scene) -> Manipulator:
-    return next(m for m in scene.tools if m.action_dim)
 
 
 def _top(body: Body) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
 from json import dumps
 from operator import attrgetter
@@ -68,23 +69,17 @@ class TargetStore:
         """Store a mass tensor, shape [n, n, n], if the folder is writable."""
         path = self.path(scene, actions)
         node = np.flatnonzero(mass)
-        try:
+        # If the folder is not writable, the target is generated again next time.
+        with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
                 np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
             os.replace(file.name, path)
-        except OSError:
-            # The target will be regenerated next time.
-            return
 
 
 def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.ndarray:
-    """Load a target file of the original release, ``<Task>3D-v<k>.npy``.
-
-    Args:
-        folder: Folder of the files.
-        scene: The scene that the target belongs to; its name and grid count.
-        variant: Number of the variant.
+    """Load a target file of the original release, ``<Task>3D-v<k>.npy`` in ``folder``, for a scene of this
+    name, grid and mass.
 
     Returns:
         Mass tensor, shape [n, n, n], float64. A few masses may be negative, because the files were made with
@@ -95,26 +90,22 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
     """
     name = "Rollingpin" if scene.name == "RollingPin" else scene.name
     path = Path(folder) / f"{name}3D-v{variant}.npy"
-    n, expected = scene.grid_size, (scene.particle_count, RELEASE_PARTICLES)
+    n, unit = scene.grid_size, scene.particle_mass
     try:
         mass = read_array(path)
         if mass.shape != (n, n, n) or mass.dtype.kind not in "fiu" or not np.isfinite(mass).all():
-            what = f"shape {mass.shape} of {mass.dtype}, the grid needs finite numbers of shape {(n, n, n)}"
-            raise UnreadableError(f"has {what}")
-        negative, total = (float(part.sum()) / scene.particle_mass for part in (-mass.clip(None, 0), mass))
+            needed = f"the grid needs finite numbers of shape {(n, n, n)}"
+            raise UnreadableError(f"has shape {mass.shape} of {mass.dtype}, {needed}")
+        negative, total = -float(mass.clip(None, 0).sum()) / unit, float(mass.sum()) / unit
         if negative > NEGATIVE_PARTICLES:
-            raise UnreadableError(
-                f"has negative masses, {negative:.3g} particle masses in all where the release's files have "
-                f"up to {NEGATIVE_PARTICLES:g}: the least is {mass.min():.3g}"
-            )
+            most = f"at most {NEGATIVE_PARTICLES:g} in the release's files: the least is {mass.min():.3g}"
+            raise UnreadableError(f"has negative masses, {negative:.3g} particle masses in all, {most}")
+        expected = (scene.particle_count, RELEASE_PARTICLES)
         if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
-            raise UnreadableError(
-                f"holds {total:.0f} particle masses of {scene.particle_mass:.3g}, but the scene has "
-                f"{scene.particle_count} and the release's files {RELEASE_PARTICLES}"
-            )
+            raise UnreadableError(f"holds {total:.0f} particle masses, not {' or '.join(map(str, expected))}")
     except FileNotFoundError:
-        wanted = "does not exist; name the files like Move3D-v1.npy"
-        raise TargetError(f"targets.source: {path} {wanted}") from None
+        reason = "does not exist; name the files like Move3D-v1.npy"
+        raise TargetError(f"targets.source: {path} {reason}") from None
     except (UnreadableError, OSError) as error:
         raise TargetError(f"targets.source: {path} {getattr(error, 'strerror', None) or error}") from None
     return mass.astype(np.float64)
