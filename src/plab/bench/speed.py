@@ -99,7 +99,12 @@ def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, ob
     """Return the milliseconds per environment step of one environment of a task, beside the paper's."""
     paper = paper_table("timing").set_index("task").loc[cfg.task.name]
     found: dict[Any, Any] = {row["what"]: row for row in rows(cfg, batch, steps, repeats, PAPER_KINDS)}
-    out = {name: next(iter(found.values()), {}).get(name) for name in PAPER_COLUMNS[:4]}
+    out: dict[str, object] = {
+        "task": cfg.task.name,
+        "device": cfg.sim.device,
+        "precision": cfg.sim.precision,
+        "batch": batch,
+    }
     columns = (("forward", REWARD, "forward_ms"), ("gradient", GRADIENT, "forward_backward_ms"))
     for name, kind, printed in columns:
         ms = found[kind]["median_ms"] / batch if kind in found else math.nan
