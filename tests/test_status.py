@@ -43,7 +43,7 @@ def find(folder: Path, *words: str, missing: bool = False):
 
 
 def counts(found) -> dict[str, int]:
-    return {state: sum(run.state == state for run in found.runs) for state in STATES}
+    return {state: int((found.runs["state"] == state).sum()) for state in STATES}
 
 
 def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder: Path) -> None:
@@ -51,7 +51,7 @@ def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder
     assert len(found.runs) == 10 * 5 * 1 * 3
     assert counts(found) == {"done": 2, "running": 0, "interrupted": 2, "failed": 1, "missing": 145}
     assert len(found.groups) == 10 and found.eta is None
-    assert [run.message for run in found.runs if run.state == "failed"] == ["iteration 2: loss is nan"]
+    assert [text for text in found.runs["message"] if text] == ["iteration 2: loss is nan"]
     # Runs outside of the grid are counted apart.
     synthetic.save(synthetic.run(folder, variant="random7"))
     assert find(folder, missing=True).others == 1 and counts(find(folder))["missing"] == 0
@@ -67,7 +67,7 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     path = begin(folder, 3, variant="3")
     assert counts(find(folder))["running"] == 0
     lock = acquire(path)
-    (run,) = find(folder, "task=Rope", "variant=1,2,3", "seed=0").running
+    (run,) = find(folder, "task=Rope", "variant=1,2,3", "seed=0").running.itertuples()
     assert (run.variant, run.done, run.total) == ("3", 3, 4)
     # Rows take about a second each; the first is left out, for it compiles.
     assert run.rate == pytest.approx(1.0, abs=0.15)
@@ -76,7 +76,7 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     assert counts(find(folder))["running"] == 0
     # Progress of reinforcement learning is in episodes.
     lock = acquire(begin(folder, 3, method="ppo"))
-    (run,) = find(folder, "method=ppo").running
+    (run,) = find(folder, "method=ppo").running.itertuples()
     assert (run.done, run.total) == (66, 100)
     assert run.rate == pytest.approx(33.0, rel=0.15)
     lock.release()
@@ -94,25 +94,25 @@ def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
         locks.append(acquire(synthetic.save(result)))
     found = find(folder, "task=Move", "variant=1")
     assert found.workers == 1
-    for run in found.running:
+    for run in found.running.itertuples():
         assert run.together == 3
         assert run.rate == pytest.approx(0.1 / run.together)
     # Three times ten seconds, less what has gone by since.
     assert 0.0 < found.eta <= 32.0
-    assert sum(run.left for run in found.running) <= 30.0
+    assert found.running["left"].sum() <= 30.0
     for lock in locks:
         lock.release()
 
 
 def test_rest_is_estimated_from_finished_runs_of_the_same_task_and_method(folder: Path) -> None:
     found = find(folder, "task=Rope", "variant=1,2", "seed=0,1,2")
-    (group,) = found.groups
+    (group,) = found.groups.itertuples()
     assert group.mean_seconds == pytest.approx(10.5, abs=0.5)
     # Three have done half, one is missing.
     assert group.left == pytest.approx((3 * 0.5 + 1) * group.mean_seconds)
     lock = acquire(begin(folder, 1, variant="2", seed=2))
     found = find(folder, "task=Rope", "variant=1,2", "seed=0,1,2")
-    assert found.workers == 1 and found.eta == pytest.approx(found.groups[0].left)
+    assert found.workers == 1 and found.eta == pytest.approx(found.groups["left"][0])
     lock.release()
 
 

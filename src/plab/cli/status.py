@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 
 from plab.cli.command import Parser, add_forms, add_sources, command_line, sources_and_words
-from plab.cli.tables import print_table
 from plab.config.selection import select
-from plab.status.survey import NAMES, STATES, Survey, survey
+from plab.status.survey import NAMES, Survey, survey
 
 
 @command_line
@@ -34,11 +32,12 @@ def main(argv: Sequence[str]) -> None:
 
     if options.form == "json":
         found = look()
-        print(json.dumps(asdict(found) | {"workers": found.workers, "eta": found.eta}, indent=1))
+        tables = {"runs": found.runs, "groups": found.groups}
+        shown = {name: json.loads(table.to_json(orient="records")) for name, table in tables.items()}
+        names = ("others", "unreadable", "protocol", "workers", "eta")
+        print(json.dumps(shown | {name: getattr(found, name) for name in names}, indent=1))
     elif options.form == "csv":
-        columns = ("task", "method", "expected", *STATES, "score", "mean_seconds", "rate", "left")
-        groups = [asdict(group) | group.counts for group in look().groups]
-        print_table(columns, ([group[name] for name in columns] for group in groups), "csv")
+        print(look().groups.to_csv(index=False), end="")
     else:
         # Imported here, because scripts need no tables.
         from plab.status.view import show, watch

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
-from rich.text import Text
 
 from plab.errors import ArgumentError, tell
 from plab.status.survey import STATES, Survey
@@ -20,15 +20,12 @@ INTERVAL = 1.0
 """Update interval [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
-"""Colours of states, in order of priority if not all runs fit on the screen."""
-
-_AROUND = 6
-"""Screen lines reserved for other output."""
+"""Colours of states, in the order of live runs."""
 
 
-def duration(seconds: float | None) -> str:
-    """Format a time: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
-    if seconds is None or not math.isfinite(seconds):
+def duration(seconds: float) -> str:
+    """Format a time: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``; ``?`` for NaN."""
+    if not math.isfinite(seconds):
         return "?"
     if seconds < 100:
         return f"{seconds:.0f} s"
@@ -43,22 +40,20 @@ def show(found: Survey) -> None:
     """Print a table by task and method, the running and failed runs, and totals."""
     console = Console() if sys.stdout.isatty() else Console(width=80)
     table = _table("task", "method", "done", "not done", "score", "mean time", "time left")
-    for group in found.groups:
-        mean = "" if group.mean_seconds is None else duration(group.mean_seconds)
+    for group in found.groups.itertuples():
+        mean = "" if math.isnan(group.mean_seconds) else duration(group.mean_seconds)
         left = "" if group.left == 0 else duration(group.left)
-        open_runs = [f"{group.counts[state]} {state}" for state in STATES[1:] if group.counts[state]]
-        done = f"{group.counts['done']}/{group.expected}"
-        table.add_row(group.task, group.method, done, ", ".join(open_runs), _score(group.score), mean, left)
+        rest = [f"{count} {state}" for state in STATES[1:] if (count := getattr(group, state))]
+        done = f"{group.done}/{group.expected}"
+        table.add_row(group.task, group.method, done, ", ".join(rest), _number(group.score), mean, left)
     console.print(table)
     lines = [] if found.protocol == "plab" else [f"protocol: {found.protocol}"]
-    for run in found.runs:
+    for run in found.runs.itertuples():
         if run.state == "running":
-            left = duration(None if run.left is None else run.left * run.together)
-            lines.append(
-                f"running: {run.name}: {f'{run.done}/{run.total}, {left} left' if run.total else 'starting'}"
-            )
+            left = f"{run.done}/{run.total}, {duration(run.left * run.together)} left"
+            lines.append(f"running: {_name(run)}: {left if run.total else 'starting'}")
         elif run.state == "failed":
-            lines.append(f"failed: {run.name}: {run.message}")
+            lines.append(f"failed: {_name(run)}: {run.message}")
     lines += _sums(found)
     if found.others:
         lines.append(f"{found.others} further run(s) in the results, of other names or other settings")
@@ -66,29 +61,6 @@ def show(found: Survey) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for error in found.unreadable:
         tell(f"left out: {error}")
-
-
-def _table(*titles: str) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for title in titles:
-        text = title in ("task", "method", "run", "state", "not done")
-        table.add_column(title, justify="left" if text else "right")
-    return table
-
-
-def _score(score: float | None) -> str:
-    return "" if score is None else f"{score:.2f}"
-
-
-def _sums(found: Survey) -> list[str]:
-    if not found.runs:
-        return ["no runs: python -m plab.run task=Move makes one"]
-    totals = Counter(run.state for run in found.runs)
-    counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
-    lines = [f"{len(found.runs)} runs: {counts}"]
-    if found.eta is not None:
-        lines.append(f"all done in {duration(found.eta)}, with {found.workers} at work")
-    return lines
 
 
 def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.sleep) -> None:
@@ -103,27 +75,48 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
     with Live(console=console, auto_refresh=False) as live:
         while True:
             found = look()
-            live.update(_screen(found, console.height - _AROUND), refresh=True)
-            if found.runs and all(run.state in ("done", "failed") for run in found.runs):
+            live.update(_screen(found), refresh=True)
+            if len(found.runs) and found.runs["state"].isin(("done", "failed")).all():
                 return
             pause(INTERVAL)
 
 
-def _screen(found: Survey, room: int) -> Group:
-    """Return a table with a line per run, as many as fit, and totals."""
+def _screen(found: Survey) -> Group:
+    """Return totals, and a table with a line per run, runs in progress first, which Rich cuts off at the end
+    of the screen."""
     table = _table("run", "state", "done", "score", "rate", "time left")
-    runs = found.runs
-    if len(runs) > room:
-        runs = sorted(runs, key=lambda run: list(_COLOURS).index(run.state))[: max(room, 1)]
-    for run in runs:
-        state = Text(run.state, _COLOURS[run.state])
-        if run.message:
-            state.append(f": {run.message}", "default")
+    for run in sorted(found.runs.itertuples(), key=lambda run: list(_COLOURS).index(run.state)):
+        state = f"[{_COLOURS[run.state]}]{run.state}[/]" + (f": {escape(run.message)}" if run.message else "")
         done = f"{run.done}/{run.total}" if run.total else ""
-        rate = "" if run.rate is None else f"{run.rate:.3g}/s"
+        rate = "" if math.isnan(run.rate) else f"{run.rate:.3g}/s"
         # Runs that share a process wait for each other.
-        left = duration(None if run.left is None else run.left * run.together)
-        left = left if run.state == "running" else ""
-        table.add_row(Text(run.name), state, done, _score(run.score), rate, left)
-    rest = len(found.runs) - len(runs)
-    return Group(table, *([f"... and {rest} more"] if rest else []), *_sums(found))
+        left = duration(run.left * run.together) if run.state == "running" else ""
+        table.add_row(escape(_name(run)), state, done, _number(run.score), rate, left)
+    return Group(*_sums(found), table)
+
+
+def _table(*titles: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for title in titles:
+        text = title in ("task", "method", "run", "state", "not done")
+        table.add_column(title, justify="left" if text else "right")
+    return table
+
+
+def _name(run: Any) -> str:
+    return f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
+
+
+def _number(score: float) -> str:
+    return "" if math.isnan(score) else f"{score:.2f}"
+
+
+def _sums(found: Survey) -> list[str]:
+    if not len(found.runs):
+        return ["no runs: plab run task=Move makes one"]
+    totals = found.runs["state"].value_counts()
+    counts = ", ".join(f"{totals[state]} {state}" for state in STATES if state in totals)
+    lines = [f"{len(found.runs)} runs: {counts}"]
+    if found.eta is not None:
+        lines.append(f"all done in {duration(found.eta)}, with {found.workers} at work")
+    return lines
