@@ -257,7 +257,7 @@ def test_a_policy_is_run_only_if_asked(
     made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
     entries = read(made).entries
     assert [e.configuration.variant for e in entries] == ["1", "2", *UNSEEN[:2]]
-    assert len({e.digests for e in entries}) == 4 and {e.steps for e in entries} == {60}
+    assert len({e.checksum for e in entries}) == 4 and {e.steps for e in entries} == {60}
     assert max(e.score for e in entries) > 0
     assert verify([str(made), *COARSE, "--float32"]) == 1
     (line,) = capsys.readouterr().err.splitlines()

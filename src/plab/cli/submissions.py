@@ -181,13 +181,14 @@ def leaderboard(argv: Sequence[str]) -> None:
     what = "folder to write to (default: reports/leaderboard)"
     parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
     options = parser.parse_intermixed_args(argv)
-    made = board(options.folder, options.overrides)
+    sections, left_out = board(options.folder, options.overrides)
     html = render(
         "leaderboard.html",
         _PACKAGE,
         style=asset("page.css") + asset("leaderboard.css", _PACKAGE),
         script=asset("theme.js") + asset("leaderboard.js", _PACKAGE),
-        board=made,
+        sections=sections,
+        left_out=left_out,
         budgets=[f"{count / 1e6:g}M" if count >= 1e6 else f"{count / 1e3:g}k" for count in BUDGETS],
         tasks=suite_tasks(),
         tolerance=TOLERANCE,
@@ -200,6 +201,6 @@ def leaderboard(argv: Sequence[str]) -> None:
     )
     path = options.out / "index.html"
     replace_file(path, html)
-    for line in made.left_out:
+    for line in left_out:
         tell(f"left out: {line}")
-    print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
+    print(f"{path}: {sum(len(section['lines']) for section in sections)} lines")

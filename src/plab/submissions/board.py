@@ -6,9 +6,9 @@ import functools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import pandas as pd
 
@@ -24,9 +24,9 @@ from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.submission import (
     UNSEEN,
     Card,
-    Checksums,
     Configuration,
     SubmissionError,
+    checksum,
     read,
 )
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
@@ -43,57 +43,6 @@ TableKey: TypeAlias = tuple[str, str]
 
 Point: TypeAlias = tuple[str, str, int, float, float]
 """Task, variant, environment steps, score in float32 and in float64 (NaN if unknown)."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of a table.
-
-    Attributes:
-        card: The method.
-        track: ``plans`` or ``policies``.
-        status: ``verified``, ``claimed``, ``printed`` (the paper's) or ``own runs`` (plab's).
-        covered: Number of configurations with a score.
-        budgets: Mean score of all configurations of the table within each budget; missing configurations
-            count as 0; None without entries.
-        score: Mean score without a limit.
-        exact: The same in float64; None if unknown.
-        tasks: The same by task; None for tasks without a score.
-    """
-
-    card: Card
-    track: str
-    status: str
-    covered: int
-    budgets: tuple[float | None, ...]
-    score: float
-    exact: float | None
-    tasks: tuple[float | None, ...]
-
-
-@dataclass(frozen=True)
-class BoardTable:
-    """A table for one protocol and one set of targets.
-
-    Attributes:
-        title: Its heading.
-        protocol: Conditions of the scores, in sentences.
-        expected: Number of configurations.
-        lines: Best first.
-    """
-
-    title: str
-    protocol: str
-    expected: int
-    lines: tuple[Line, ...]
-
-
-@dataclass(frozen=True)
-class Board:
-    """All tables, and a message for each file that is in none of them."""
-
-    sections: tuple[BoardTable, ...]
-    left_out: tuple[str, ...]
 
 
 _PLAYED = "The score is that of one episode in the hard contact model, of the plan or policy handed in."
@@ -120,10 +69,17 @@ _TABLES: dict[TableKey, str] = {
 """Ends of headings, in the order of the page; the first four tables are shown without lines, too."""
 
 
-def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
+def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, Any]], list[str]]:
     """Generate the leaderboard for a folder of submissions and their verifications by ``plab verify``.
 
-    Overrides of all configurations of the table.
+    Args:
+        folder: The folder.
+        overrides: Overrides of all configurations of the table.
+
+    Returns:
+        Tables for the page, each with ``title``, ``protocol`` (conditions of the scores, in sentences),
+        ``expected`` (number of configurations) and ``lines`` of :func:`_line`, best first; and a message for
+        each file that is in none of them.
 
     Raises:
         SubmissionError: If there is no such folder.
@@ -131,7 +87,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     """
     if not folder.is_dir():
         raise SubmissionError(f"there is no folder {folder}")
-    tables: dict[TableKey, list[Line]] = defaultdict(list)
+    tables: dict[TableKey, list[dict[str, Any]]] = defaultdict(list)
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
@@ -148,16 +104,25 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
         if tables[kind, terms] or number < 4:
             protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
             sections.append(_table(f"{title}{ending}", protocol, kind, tables[kind, terms]))
-    return Board((*sections, _paper()), tuple(left_out))
+    return [*sections, _paper()], left_out
 
 
-def _table(title: str, protocol: str, kind: str, lines: Iterable[Line]) -> BoardTable:
-    best_first = tuple(sorted(lines, key=lambda line: (-line.score, line.card.name)))
-    return BoardTable(title, protocol, len(suite_tasks()) * _TARGETS[kind][-1], best_first)
+def _table(title: str, protocol: str, kind: str, lines: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    best_first = sorted(lines, key=lambda line: (-line["score"], line["card"].name))
+    expected = len(suite_tasks()) * _TARGETS[kind][-1]
+    return {"title": title, "protocol": protocol, "expected": expected, "lines": best_first}
 
 
-def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> Line:
-    """Summarise the results of a method for a table."""
+def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> dict[str, Any]:
+    """Return a line of a table.
+
+    Returns:
+        ``card``; ``track`` (``plans`` or ``policies``); ``status`` (``verified``, ``claimed``, ``printed``,
+        the paper's, or ``own runs``, plab's); ``covered``, number of configurations with a score; ``score``,
+        mean over all configurations of the table, missing ones counting as 0; ``exact``, the same in float64,
+        None if unknown; ``budgets``, the same within each budget, None without entries; ``tasks``, the same
+        by task, None without scores.
+    """
     table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
     each = _TARGETS[kind][-1]
     expected = len(suite_tasks()) * each
@@ -168,27 +133,28 @@ def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point
     within = [best(table[table["steps"] <= limit]) for limit in BUDGETS]
     whole = best(table)
     tasks = (whole.groupby("task")["score"].sum() / each).to_dict()
-    return Line(
-        card,
-        track,
-        status,
-        covered=len(whole),
-        budgets=tuple(float(rows["score"].sum()) / expected if len(rows) else None for rows in within),
-        score=float(whole["score"].sum()) / expected,
-        exact=None if whole["exact"].isna().any() else float(whole["exact"].sum()) / expected,
-        tasks=tuple(map(tasks.get, suite_tasks())),
-    )
+    return {
+        "card": card,
+        "track": track,
+        "status": status,
+        "covered": len(whole),
+        "budgets": [float(rows["score"].sum()) / expected if len(rows) else None for rows in within],
+        "score": float(whole["score"].sum()) / expected,
+        "exact": None if whole["exact"].isna().any() else float(whole["exact"].sum()) / expected,
+        "tasks": [tasks.get(task) for task in suite_tasks()],
+    }
 
 
 # ------------------------------------------------------------------------------------------------ submissions
 
 
 @functools.cache
-def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Checksums:
-    return Checksums.of(configuration.config(overrides))
+def _known_checksum(one: Configuration, overrides: tuple[str, ...]) -> str:
+    # The scene does not depend on the target, so the authors' files are not needed.
+    return checksum(replace(one, targets="suite").config(overrides), one.targets)
 
 
-def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
+def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, dict[str, Any]]]:
     """Yield the lines of a submission with their tables.
 
     Raises:
@@ -201,12 +167,9 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
         what = f"physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
         raise SubmissionError(f"{path} is of {what}")
     for entry in submission.entries:
-        # The scene does not depend on the target, so the authors' files are not needed.
-        known = _digests(replace(entry.configuration, targets="suite"), overrides)
-        part = entry.digests.difference(known)
-        if part == "scene" or (part and entry.configuration.targets == "suite"):
-            other = f"the {part} of {entry.configuration.name} is another one than on this leaderboard"
-            raise SubmissionError(f"{path}: {other}")
+        if entry.checksum != _known_checksum(entry.configuration, overrides):
+            other = f"scene or target of {entry.configuration.name} is another one than on this leaderboard"
+            raise SubmissionError(f"{path}: the {other}")
     verification, status = read_verification(submission), "claimed"
     if verification is not None:
         if wrong := [v for v in verification.verdicts if v.outcome in (LIES, BROKE_OFF)]:
@@ -236,7 +199,7 @@ def _runs(archive: str) -> dict[Card, list[Row]]:
     return groups
 
 
-def _own_runs(archive: str, kind: str) -> Iterator[Line]:
+def _own_runs(archive: str, kind: str) -> Iterator[dict[str, Any]]:
     for card, runs in _runs(archive).items():
         points = [_point(row, steps_to_best(row), "score_best") for row in runs]
         yield _line(card, "plans", "own runs", kind, points)
@@ -246,7 +209,7 @@ def _point(row: Row, steps: int, score: str) -> Point:
     return row.values["task"], row.values["variant"], steps, row.values[score], math.nan
 
 
-def _paper() -> BoardTable:
+def _paper() -> dict[str, Any]:
     """Return the paper's table, with comparable runs of plab."""
     lines = []
     for name, own in paper_table("iou_per_configuration").groupby("method", sort=False):

@@ -24,11 +24,11 @@ from plab.results import ResultsError, Row
 from plab.results.table import rows
 from plab.submissions.submission import (
     SUFFIX,
-    Checksums,
     Configuration,
     Entry,
     Submission,
     SubmissionError,
+    checksum,
     configuration_of,
     encode,
     read,
@@ -61,7 +61,8 @@ class _BestEpisodes:
             ResultsError: If it cannot be written.
         """
         self.steps = 0
-        self._configuration, self._digests = configuration_of(cfg), Checksums.of(cfg)
+        self._configuration = configuration_of(cfg)
+        self._checksum = checksum(cfg, self._configuration.targets)
         self._best: dict[float, Entry] = {}
         self._path = path
         try:
@@ -84,7 +85,7 @@ class _BestEpisodes:
         ]
         if not better:
             return
-        entry = Entry(self._configuration, self._digests, self.steps, score, np.clip(actions, -1.0, 1.0))
+        entry = Entry(self._configuration, self._checksum, self.steps, score, np.clip(actions, -1.0, 1.0))
         self._best |= dict.fromkeys(better, entry)
         kept = {best.steps: best for best in self._best.values()}
         write(Submission(None, tuple(kept[steps] for steps in sorted(kept))), self._path)
@@ -187,9 +188,9 @@ def _of_run(row: Row) -> Entry:
         cfg, actions = rollouts.stored(row.path)
     except RenderError as error:
         raise SubmissionError(str(error)) from None
-    return Entry(
-        configuration_of(cfg), Checksums.of(cfg), steps_to_best(row), row.values["score_best"], actions
-    )
+    configuration, steps = configuration_of(cfg), steps_to_best(row)
+    same = checksum(cfg, configuration.targets)
+    return Entry(configuration, same, steps, row.values["score_best"], actions)
 
 
 def steps_to_best(row: Row) -> int:
@@ -225,9 +226,10 @@ def from_policies(
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
         cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
         played = play(cfgs, load_policy(name, files[name]), "float32", str(path))
-        for cfg, one in zip(cfgs, played, strict=True):
+        for cfg, (score, failure) in zip(cfgs, played, strict=True):
             configuration = configuration_of(cfg)
-            if one.failure:
-                raise SubmissionError(f"{configuration.name}: the simulation diverged, {one.failure}")
-            entries.append(Entry(configuration, Checksums.of(cfg), steps, one.score, policy=name))
+            if failure:
+                raise SubmissionError(f"{configuration.name}: the simulation diverged, {failure}")
+            same = checksum(cfg, configuration.targets)
+            entries.append(Entry(configuration, same, steps, score, policy=name))
     return entries, files

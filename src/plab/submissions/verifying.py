@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -25,11 +25,11 @@ from plab.results.running import now
 from plab.scenes import PRECISIONS
 from plab.submissions.submission import (
     SUFFIX,
-    Checksums,
     Configuration,
     Entry,
     Submission,
     SubmissionError,
+    checksum,
 )
 from plab.targets.store import PHYSICS_VERSION
 
@@ -37,20 +37,13 @@ TOLERANCE = 0.02
 """Tolerance between claimed and simulated scores. The CPU is bitwise reproducible; on CUDA the last digits
 vary, amplified by contact."""
 
-OUTCOMES = HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
+HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
 
 _BATCH = 25
 """Maximum number of configurations in one simulator."""
 
 Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """Function of observations, float32, shape [batch, entry], that returns actions, shape [batch, action]."""
-
-
-class ReplayedScore(NamedTuple):
-    """Score of an episode's last state, NaN after a divergence, and the reason."""
-
-    score: float
-    failure: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ class Verdict:
     Attributes:
         entry: The claim.
         scores: Simulated score by precision; empty if it was not run.
-        outcome: One of :data:`OUTCOMES`.
+        outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
         why: One-line reason, empty if it holds.
     """
 
@@ -109,7 +102,7 @@ def verify(
     """
     given = tuple(overrides)
     cfgs = _configs(submission, given)
-    scores: dict[int, dict[str, ReplayedScore]] = defaultdict(dict)
+    played: dict[int, dict[str, tuple[float, str]]] = defaultdict(dict)
     # Each group fits into one simulator.
     alike: dict[Any, list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
@@ -125,36 +118,36 @@ def verify(
             plans = [entry.actions for entry in entries if entry.actions is not None]
             actor = policies[name] if name else plans
             for number, one in zip(numbers, play(chosen, actor, precision, name), strict=True):
-                scores[number][precision] = one
-    verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
+                played[number][precision] = one
+    verdicts = tuple(_verdict(entry, played[n]) for n, entry in enumerate(submission.entries))
     return Verification(submission.digest, verdicts, given)
 
 
 def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
     """Compose all configurations, and reject those that differ from the submission's."""
+    versions = f"({submission.plab}, this is {plab.__version__})"
     if submission.physics != PHYSICS_VERSION:
         raise SubmissionError(
-            f"{submission.path} is of physics version {submission.physics} (plab {submission.plab}), this "
-            f"plab ({plab.__version__}) simulates version {PHYSICS_VERSION}"
+            f"{submission.path} is of physics version {submission.physics}, this plab simulates version "
+            f"{PHYSICS_VERSION}: use its plab {versions}"
         )
-    names = {entry.configuration for entry in submission.entries}
-    found = {configuration: configuration.config(overrides) for configuration in sorted(names)}
-    digests = {configuration: Checksums.of(cfg) for configuration, cfg in found.items()}
+    found: dict[Configuration, Config] = {}
     for entry in submission.entries:
-        if part := entry.digests.difference(digests[entry.configuration]):
+        one = entry.configuration
+        cfg = found[one] = found.get(one) or one.config(overrides)
+        if entry.checksum != checksum(cfg, one.targets):
             raise SubmissionError(
-                f"{submission.path}: the {part} of {entry.configuration.name} is another one than here: give "
-                f"the overrides that it was made with, or use its plab ({submission.plab}, this is "
-                f"{plab.__version__})"
+                f"{submission.path}: the scene or target of {one.name} is another one than here: give the "
+                f"overrides that it was made with, or use its plab {versions}"
             )
     return found
 
 
-def _verdict(entry: Entry, played: Mapping[str, ReplayedScore]) -> Verdict:
+def _verdict(entry: Entry, played: Mapping[str, tuple[float, str]]) -> Verdict:
     if not played:
         return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
-    scores = {precision: one.score for precision, one in played.items()}
-    if broken := [f"{precision}: {one.failure}" for precision, one in played.items() if one.failure]:
+    scores = {precision: score for precision, (score, _) in played.items()}
+    if broken := [f"{precision}: {failure}" for precision, (_, failure) in played.items() if failure]:
         return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation diverged, {broken[0]}")
     if min(abs(score - entry.score) for score in scores.values()) <= TOLERANCE:
         return Verdict(entry, scores, HOLDS)
@@ -168,7 +161,7 @@ def _verdict(entry: Entry, played: Mapping[str, ReplayedScore]) -> Verdict:
 
 def play(
     cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], precision: str, name: str = ""
-) -> list[ReplayedScore]:
+) -> list[tuple[float, str]]:
     """Simulate plans or a policy in several configurations of one task, in the hard contact model.
 
     Args:
@@ -177,11 +170,14 @@ def play(
         precision: ``float32`` or ``float64``; observations are float32 in both.
         name: Name of the policy in messages.
 
+    Returns:
+        Score of each episode's last state, and an empty text; after a divergence NaN and the reason.
+
     Raises:
         SubmissionError: If a plan has a wrong shape, or the policy cannot be run, returns invalid actions, or
             is not deterministic.
     """
-    played: list[ReplayedScore] = []
+    played: list[tuple[float, str]] = []
     for start in range(0, len(cfgs), _BATCH):
         some = cfgs[start : start + _BATCH]
         batch = EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
@@ -198,7 +194,7 @@ def play(
         batch.close()
         for n, score in enumerate(step.info["score"]):
             failure = step.failures.get(n, "")
-            played.append(ReplayedScore(math.nan if failure else float(score), failure))
+            played.append((math.nan if failure else float(score), failure))
     return played
 
 
@@ -289,26 +285,14 @@ def write_verification(verification: Verification, submission: Path) -> Path:
         plab.results.ResultsError: If it cannot be written.
     """
     path = verification_path(submission)
-    entries = [
-        {
-            "name": verdict.entry.name,
-            "claimed": verdict.entry.score,
-            "scores": {name: None if math.isnan(v) else v for name, v in verdict.scores.items()},
-            "outcome": verdict.outcome,
-            "why": verdict.why,
-        }
-        for verdict in verification.verdicts
+    verdicts = [
+        {"name": one.entry.name, "claimed": one.entry.score, "scores": one.scores}
+        | {"outcome": one.outcome, "why": one.why}
+        for one in verification.verdicts
     ]
-    record = {
-        "submission": verification.digest,
-        "plab": plab.__version__,
-        "physics": PHYSICS_VERSION,
-        "overrides": list(verification.overrides),
-        "tolerance": TOLERANCE,
-        "time": now(),
-        "entries": entries,
-    }
-    replace_file(path, json.dumps(record, indent=1) + "\n")
+    record = {"submission": verification.digest, "plab": plab.__version__, "physics": PHYSICS_VERSION}
+    record |= {"overrides": list(verification.overrides), "tolerance": TOLERANCE, "time": now()}
+    replace_file(path, json.dumps(record | {"entries": verdicts}, indent=1) + "\n")
     return path
 
 
@@ -324,11 +308,6 @@ def read_verification(submission: Submission) -> Verification | None:
         record = json.loads(path.read_bytes())
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
             return None
-        verdicts = []
-        for entry, own in zip(submission.entries, record["entries"], strict=True):
-            scores = {name: math.nan if v is None else float(v) for name, v in own["scores"].items()}
-            wrong = any(v is not None and not 0.0 <= v <= 1.0 for v in own["scores"].values())
-            if wrong or own["outcome"] not in OUTCOMES or not own["why"].isprintable():
-                raise ValueError(f"{entry.name} has an outcome that plab verify does not write")
-            verdicts.append(Verdict(entry, scores, own["outcome"], own["why"]))
-        return Verification(submission.digest, tuple(verdicts), tuple(record["overrides"]))
+        pairs = zip(submission.entries, record["entries"], strict=True)
+        verdicts = tuple(Verdict(entry, own["scores"], own["outcome"], own["why"]) for entry, own in pairs)
+        return Verification(submission.digest, verdicts, tuple(record["overrides"]))
