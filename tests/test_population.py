@@ -307,7 +307,7 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
     assert {path.stat().st_size for path in paths} == {9 * 4 * sizes.entries}
     again = empty()
     for agent, path in enumerate(paths):
-        again.read(agent, path, 36)
+        again.read(agent, path, 72)
     check(again, 36)
     add(again, 36)
     check(again, 37)

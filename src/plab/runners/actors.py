@@ -22,7 +22,7 @@ from plab.runners.policy import (
     packed,
     unpacked,
 )
-from plab.runners.training import PolicyRunner, Training, TrainingSummary
+from plab.runners.training import Training, TrainingSummary
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -106,6 +106,16 @@ class ActorTraining(Training):
         self.broken: list[str] = []
         self._measured: dict[str, list[float]] = {}
 
+    @classmethod
+    def environments(cls, cfg: Config) -> list[Config]:
+        method: Any = cfg.method
+        if method.torch_device != cfg.sim.device:
+            raise ConfigError(
+                f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
+                f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
+            )
+        return training_scenes(cfg, method, method.num_envs)
+
     @staticmethod
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
         """Return the initial policy, on the CPU."""
@@ -184,22 +194,6 @@ class ActorTraining(Training):
         self.statistics.count = float(count)
         self._generator.set_state(state["generator"])
         self._steps, self._evaluated = state["steps"], state["steps"] // self._horizon
-
-
-class ActorRunner(PolicyRunner):
-    """Base of runners that train a policy with the gradient, in the run's scene or in random scenes."""
-
-    def require_torch_device(self) -> None:
-        """Raise ConfigError if the device is not available in torch, or differs from the simulator's."""
-        super().require_torch_device()
-        if self.method.torch_device != (device := self.tracks[0].cfg.sim.device):
-            raise ConfigError(
-                f"the gradient of {self.method.algorithm} goes from the simulator's device to that of its "
-                f"networks: set method.torch_device={device}, as sim.device"
-            )
-
-    def training_configs(self) -> list[Config]:
-        return training_scenes(self.tracks[0].cfg, self.method, self.method.num_envs)
 
 
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:

@@ -240,9 +240,10 @@ class ReplayBuffer:
             raise ResultsError(f"cannot write the replay buffer {path}: {error.strerror or error}") from error
         self._written[agent] = last
 
-    def read(self, agent: int, path: Path, added: int) -> None:
-        """Load whole episodes of N environments from an agent's file, the same number for all agents;
-        ResultsError if that fails."""
+    def read(self, agent: int, path: Path, steps: int) -> None:
+        """Load whole episodes of N environments from an agent's file, given the number of transitions, the
+        same for all agents; ResultsError if that fails."""
+        added = steps // self._sizes.envs
         self._count_to(added)
         self._written[agent] = last = added // self._sizes.horizon
         first = max(0, last - self._capacity)

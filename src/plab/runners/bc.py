@@ -9,8 +9,8 @@ Datasets are written by ``plab dataset`` or Minari. To reproduce a result:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +20,7 @@ from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
 from plab.runners.actors import ActorTraining, set_rate
 from plab.runners.policy import PolicyConfig, Spaces
-from plab.runners.runner import Step, Track
-from plab.runners.training import PolicyRunner, shared_batches, whole_cycles
+from plab.runners.training import PolicyRunner, whole_cycles
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
@@ -83,17 +82,22 @@ class Cloning(Imitation):
     """A policy trained on a dataset; a cycle is one pass."""
 
     columns = ("imitation_error",)
+    simulates = False
 
-    def __init__(
-        self, cfgs: Sequence[Config], batch: EpisodeBatch, data: tuple[np.ndarray, np.ndarray]
-    ) -> None:
-        """Begin with observations, shape [row, entry], and actions, shape [row, A]."""
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
+        """Begin with the observations and actions of the dataset."""
         super().__init__(cfgs, batch)
+        data = pairs(self._method, self._spaces)
+        self.provenance["dataset_rows"] = len(data[0])
         self.total_steps = whole_cycles(self._method.episodes * batch.horizon, len(data[0]))
         self.statistics.update(data[0].astype(np.float64))
         self.freeze_moments()
         seen, self._wanted = (torch.as_tensor(part, device=self._device) for part in data)
         self._seen = self.scaled(seen)
+
+    @classmethod
+    def environments(cls, cfg: Config) -> list[Config]:
+        return []
 
     def cycle(self) -> None:
         """Pass over the data once."""
@@ -106,29 +110,6 @@ class Cloning(Imitation):
         set_rate(self._optimizer, self._method.lr * rate_left)
         count = math.ceil(len(self._seen) / self._method.batch_size)
         self.note(imitation_error=np.array([self.imitate(self._seen, self._wanted, count)]))
-
-
-class BcRunner(PolicyRunner):
-    """Runner of behaviour cloning; each iteration consists of some passes over the data and one evaluation
-    episode."""
-
-    def build(self) -> None:
-        """Read the dataset, and create the evaluation environment."""
-        from plab.envs.tensors import TensorEnv
-
-        self.require_torch_device()
-        cfgs = [track.cfg for track in self.tracks]
-        (judge,) = shared_batches(self.cache, (cfgs, "hard"))
-        self._judge, self.problem = TensorEnv(judge), judge.problem
-        data = pairs(self.method, Spaces.of(judge))
-        self.policies = Cloning(cfgs, judge, data)
-        for track in self.tracks:
-            track.run.result.provenance["dataset_rows"] = len(data[0])
-
-    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Train until the next evaluation is due; only evaluations use the simulator."""
-        for track, step in super().iterate(tracks):
-            yield track, replace(step, steps_forward=len(step.actions), steps_gradient=0)
 
 
 def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +139,7 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
 FAMILY = Family(
     label="a policy that imitates the actions of a dataset",
     config=BcConfig,
-    runner=BcRunner,
+    runner=PolicyRunner,
     columns=Cloning.columns,
     may_be_nan=Cloning.columns,
     ranking="score",

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorConfig, ActorRunner, set_rate, training_scenes
+from plab.runners.actors import ActorConfig, set_rate, training_scenes
 from plab.runners.bc import Imitation
+from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
@@ -65,6 +66,12 @@ class PodsTraining(Imitation):
         super().__init__(cfgs, batch)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    @classmethod
+    def environments(cls, cfg: Config) -> list[Config]:
+        """Return the configurations of one scene per environment, up to ``num_envs``."""
+        scenes = cfg.method_as(PodsConfig).scenes
+        return super().environments(cfg)[: max(1, scenes)]
 
     def learn(self, rate_left: float) -> None:
         """Run a round: act, improve the actions, and imitate them."""
@@ -138,21 +145,10 @@ class PodsTraining(Imitation):
         self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in state["rounds"]]
 
 
-class PodsRunner(ActorRunner):
-    """Runner of a policy; each iteration consists of some rounds and one evaluation episode."""
-
-    training = PodsTraining
-
-    def training_configs(self) -> list[Config]:
-        """Return one scene per environment, up to ``num_envs``."""
-        method = self.method
-        return training_scenes(self.tracks[0].cfg, method, min(max(1, method.scenes), method.num_envs))
-
-
 FAMILY = Family(
     label="a policy that imitates its own episodes, improved by the simulator's gradient",
     config=PodsConfig,
-    runner=PodsRunner,
+    runner=PolicyRunner,
     columns=PodsTraining.columns,
     may_be_nan=PodsTraining.columns,
     rules={"pods": Rule(PodsTraining, PodsConfig)},

@@ -10,8 +10,6 @@ deterministic policy, which gives a row of the results. To reproduce a result:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +17,8 @@ import numpy as np
 from plab.config import Config
 from plab.config.families import RL, Appearance, Family, Rule, family
 from plab.plugins import torch
-from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, RlConfig, Sizes
-from plab.runners.policy import Moments, Spaces, torch_settings
+from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, ReplayBuffer, RlConfig, Sizes
+from plab.runners.policy import Moments, Spaces
 from plab.runners.ppo import PpoAgents, PpoConfig
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
@@ -48,6 +46,8 @@ class Population(Training):
     Attributes:
         stacks: The agents.
     """
+
+    tf32 = True
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Build untrained agents for configurations with the same section ``method``.
@@ -120,15 +120,9 @@ class Population(Training):
         stack.restore(number, state)
         self._restored[run] = state["episode_actions"]
 
-    def write(self, run: int, path: Path) -> None:
+    def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
         stack, number = self._places[run]
-        if isinstance(stack, OffPolicyAgents):
-            stack.replay.write(number, path)
-
-    def read(self, run: int, path: Path) -> None:
-        stack, number = self._places[run]
-        if isinstance(stack, OffPolicyAgents):
-            stack.replay.read(number, path, stack.steps // self._envs)
+        return (stack.replay, number) if isinstance(stack, OffPolicyAgents) else None
 
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
         stack, number = self._places[run]
@@ -199,10 +193,6 @@ class RlRunner(PolicyRunner):
     """Runner of a population of agents."""
 
     training = Population
-
-    def context(self) -> AbstractContextManager[Any]:
-        # The first layers, with 1,200 inputs and more, dominate the time of an update on a GPU.
-        return torch_settings(self.method.torch_threads, tf32=self.method.torch_device == "cuda")
 
 
 FAMILY = Family(

@@ -12,7 +12,6 @@ import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,20 +159,12 @@ class Sb3Training(Training):
             torch.cuda.set_rng_state(random["cuda"])
         self.model.action_space.np_random.bit_generator.state = random["actions"]
 
-    def write(self, run: int, path: Path) -> None:
-        if self._replay is not None:
-            self._replay.kept.write(0, path)
-
-    def read(self, run: int, path: Path) -> None:
-        if self._replay is not None:
-            self._replay.kept.read(0, path, self.steps // self._sizes.envs)
+    def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
+        buffer = getattr(self.model, "replay_buffer", None)
+        return None if buffer is None else (buffer.kept, 0)
 
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
         return self.model.policy, None
-
-    @property
-    def _replay(self) -> _Replay | None:
-        return getattr(self.model, "replay_buffer", None)
 
 
 class Sb3Runner(PolicyRunner):

@@ -23,13 +23,13 @@ from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
 from plab.runners.actors import (
     ActorConfig,
-    ActorRunner,
     ActorTraining,
     actor_network,
     actor_policy,
     set_rate,
 )
 from plab.runners.policy import Spaces
+from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:
     from plab.envs.autograd import PolicySteps
@@ -154,12 +154,6 @@ class ShacTraining(ActorTraining):
         return super().learners() | own
 
 
-class ShacRunner(ActorRunner):
-    """Runner of policy and value function."""
-
-    training = ShacTraining
-
-
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:
     """Return the TD(lambda) targets, shape [T, env], of a part of an unfinished episode, from rewards, shape
     [T, env], and values before each step and after the last, shape [T + 1, env]. A ``decay`` (lambda) of 0
@@ -174,7 +168,7 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 FAMILY = Family(
     label="a policy, trained through the simulator's gradient and by a value function",
     config=ShacConfig,
-    runner=ShacRunner,
+    runner=PolicyRunner,
     columns=ShacTraining.columns,
     may_be_nan=ShacTraining.columns,
     rules={"shac": Rule(ShacTraining, ShacConfig)},

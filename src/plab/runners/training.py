@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     from plab.envs.core import EpisodeBatch
     from plab.envs.tensors import TensorEnv
+    from plab.runners.agents import ReplayBuffer
 
 NOT_FINITE = "the policy's actions are not finite"
 
@@ -146,6 +147,7 @@ class Training(ABC):
         total_steps: Total number of transitions per policy, in whole cycles.
         watched: Losses of the updates are requested.
         report: Function to call when episodes have ended.
+        provenance: Further entries of the results' provenance.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
@@ -154,7 +156,7 @@ class Training(ABC):
     round_episodes: tuple[int, int] = 1, 0
     """Episodes per environment in a cycle, and episodes with gradient."""
 
-    watched = False
+    simulates, tf32, watched = True, False, False
     report: Callable[[], None]
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch, cycle: int) -> None:
@@ -163,6 +165,12 @@ class Training(ABC):
         self.batch, self._horizon = batch, batch.horizon
         self.total_steps = whole_cycles(cfgs[0].method_as(PolicyConfig).episodes * self._horizon, cycle)
         self.report = lambda: None
+        self.provenance: dict[str, Any] = {}
+
+    @classmethod
+    def environments(cls, cfg: Config) -> list[Config]:
+        """Return the configurations of a run's training environments; none if it needs no simulations."""
+        return [cfg] * cast(Any, cfg.method).num_envs
 
     @property
     @abstractmethod
@@ -201,11 +209,9 @@ class Training(ABC):
         """Restore a policy from one of :meth:`states`; RuntimeError, ValueError or LookupError if it belongs
         to other networks."""
 
-    def write(self, run: int, path: Path) -> None:  # noqa: B027
-        """Write a policy's replay buffer, if it has one; ResultsError if that fails."""
-
-    def read(self, run: int, path: Path) -> None:  # noqa: B027
-        """Read a policy's replay buffer, if it has one; ResultsError if that fails."""
+    def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
+        """Return a policy's replay buffer and its number there, if it has one."""
+        return None
 
     @abstractmethod
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
@@ -224,50 +230,50 @@ class PolicyRunner(Runner):
     All runs are at the same evaluation; if one fails, the others restart without it.
 
     Attributes:
-        training: Subclass of :class:`Training`, constructed from configurations and environments.
+        training: Subclass of :class:`Training`, constructed from configurations and environments; None: that
+            of the algorithm's rule.
         policies: The policies in training.
     """
 
-    training: ClassVar[type[Any]]
+    training: type[Any] | None = None
     policies: Training
     _pace = 0.0
     _shown = ""
 
+    def _kind(self) -> type[Training]:
+        return self.training or self._family.rules[self.method.algorithm].what
+
     def context(self) -> AbstractContextManager[Any]:
-        return torch_settings(self.method.torch_threads)
-
-    def require_torch_device(self) -> None:
-        """Raise ConfigError if the device is not available in torch, before anything is built."""
-        if self.method.torch_device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError(
-                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
-            )
-
-    def training_configs(self) -> list[Config]:
-        """Return the configurations of the training's environments, by default ``num_envs`` per run."""
-        return [track.cfg for track in self.tracks for _ in range(self.method.num_envs)]
+        # Large first layers dominate the time of an update on a GPU.
+        tf32 = self._kind().tf32 and self.method.torch_device == "cuda"
+        return torch_settings(self.method.torch_threads, tf32=tf32)
 
     def build(self) -> None:
         """Create the training environments, and the evaluation environments in the hard contact model."""
         from plab.envs.tensors import TensorEnv
 
-        self.require_torch_device()
-        cfgs = [track.cfg for track in self.tracks]
-        judged = [without_draws(cfg) for cfg in cfgs]
-        kinds = (self.training_configs(), self.method.contact), (judged, "hard")
-        batch, judge = shared_batches(self.cache, *kinds)
+        cfgs, kind = [track.cfg for track in self.tracks], self._kind()
+        training = [one for cfg in cfgs for one in kind.environments(cfg)]
+        if self.method.torch_device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
+            )
+        kinds = [(training, self.method.contact)] if training else []
+        *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))
         self._judge, self.problem = TensorEnv(judge), judge.problem
-        self.policies = self.training(cfgs, batch)
+        self.policies = kind(cfgs, *own or [judge])
         self.policies.watched = any(track.log.wanted for track in self.tracks)
+        for track in self.tracks:
+            track.run.result.provenance |= self.policies.provenance
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Keep the initial policy, or restore policy and replay buffer from the file."""
         if state is None:
             return
         self.policies.restore(track.number, state)
-        if self.has_more(track):
+        if self.has_more(track) and (found := self.policies.replay(track.number)):
             try:
-                self.policies.read(track.number, _replay_path(track))
+                found[0].read(found[1], _replay_path(track), self.policies.steps)
             except ResultsError as error:
                 track.fail(error)
 
@@ -299,14 +305,16 @@ class PolicyRunner(Runner):
         steps = training.steps - before
         self._pace = steps / share
         every, differentiated = training.round_episodes
-        gradient = steps // every * differentiated
+        simulated = steps if training.simulates else 0
+        gradient = simulated // every * differentiated
         for track, done, own, state in zip(tracks, evaluations, learned, states, strict=True):
             start = time.perf_counter()
             if why := _unusable(track, own, done):
                 track.fail(why)
                 continue
             try:
-                training.write(track.number, _replay_path(track))
+                if found := training.replay(track.number):
+                    found[0].write(found[1], _replay_path(track))
                 track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, training.steps)
             except ResultsError as error:
                 track.fail(error)
@@ -317,7 +325,7 @@ class PolicyRunner(Runner):
                 state,
                 episodes=training.episodes,
                 steps=training.steps,
-                steps_forward=len(done.actions) + steps - gradient,
+                steps_forward=len(done.actions) + simulated - gradient,
                 steps_gradient=gradient,
                 seconds=share + time.perf_counter() - start,
                 keep=training.steps >= training.total_steps,
