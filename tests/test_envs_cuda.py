@@ -11,7 +11,7 @@ from plab.envs.autograd import policy_gradient, rollout
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
-from plab.runners.networks import CapturedUpdate
+from plab.runners.agents import CapturedUpdate
 from suite import make_not_finite
 from toy_runner import COARSE_32
 

@@ -24,7 +24,7 @@ from plab.kinematics import Chain, read_model
 from plab.kinematics.actions import JointActions
 from plab.losses import make_terms
 from plab.problem import Problem
-from plab.runners.planners.contact_starts import ContactStarts
+from plab.runners.contact_starts import ContactStarts
 from plab.scenes import Body, Manipulator, Scene, SceneError, link_manipulators
 from plab.sim import Simulator
 

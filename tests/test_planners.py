@@ -18,17 +18,16 @@ from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
-from plab.runners import RunError, run_batch, run_config, tracks
-from plab.runners.planners import planner
-from plab.runners.planners.contact_starts import ContactStarts
-from plab.runners.planners.planner import (
+from plab.runners import RunError, planner, run_batch, run_config, tracks
+from plab.runners.contact_starts import ContactStarts
+from plab.runners.planner import (
     Answer,
     CandidateStart,
     Request,
     make_planner,
 )
-from plab.runners.planners.searches import actions_of, knots_of
 from plab.runners.runner import SimulatorCache
+from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
 from plab.sweep.running import plan
 from same_runs import assert_same_numbers

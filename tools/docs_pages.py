@@ -28,9 +28,9 @@ from plab import config
 from plab.config.suite import conf_folder
 from plab.runners.agents import OffPolicyConfig, RlConfig
 from plab.runners.apg import ApgConfig
-from plab.runners.planners.planner import PlannerConfig, StagesConfig
-from plab.runners.planners.searches import CemConfig, MppiConfig, MultistartConfig, SamplerConfig
+from plab.runners.planner import PlannerConfig, StagesConfig
 from plab.runners.ppo import PpoConfig
+from plab.runners.searches import CemConfig, MppiConfig, MultistartConfig, SamplerConfig
 from plab.runners.shac import ShacConfig
 from plab.runners.td3 import Td3Config
 from plab.runners.trajectory import TrajectoryConfig

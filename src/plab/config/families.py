@@ -104,7 +104,7 @@ FAMILIES: Mapping[str, Family] = Registry(
     Family,
     {
         "trajectory": "plab.runners.trajectory:FAMILY",
-        "planner": "plab.runners.planners:FAMILY",
+        "planner": "plab.runners.searches:FAMILY",
         "rl": "plab.runners.rl:FAMILY",
         "sb3": "plab.runners.rl:SB3",
         "apg": "plab.runners.apg:FAMILY",

@@ -7,6 +7,7 @@ The file of a method contains the dataclass of its keys, its runner and its reco
 from __future__ import annotations
 
 import traceback
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -49,12 +50,11 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
         RunError: If the run failed; its results so far are kept in the partial file.
     """
     track = Track(cfg, RunFile(cfg))
-    if not track.finished_before:
-        _execute_batch([track], "", cache or SimulatorCache())
+    _execute([track], "", cache)
     if track.error is not None:
         raise track.error
-    before = "finished before" if track.finished_before else "finished"
-    print(f"{before}: score {track.run.result.score:.4f}, {track.run.path}")
+    before = " before" if track.finished_before else ""
+    print(f"finished{before}: score {track.run.result.score:.4f}, {track.run.path}")
     return track.run.result.score
 
 
@@ -79,7 +79,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
             status = "elsewhere" if isinstance(error, RunBusyError) else "refused"
             ended.append(Outcome.of(cfg, status, message=str(error)))
     todo = [one for one in ended if isinstance(one, Track) and not one.finished_before]
-    _execute_batch(todo, note, cache or SimulatorCache())
+    _execute(todo, note, cache)
     if traceback_wanted():
         # Only once if it ended several runs.
         for error in {id(track.error): track.error for track in todo}.values():
@@ -91,11 +91,11 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
     return [one.outcome() if isinstance(one, Track) else one for one in ended]
 
 
-def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-    """Execute tracks of one family; afterwards each has finished or has an error, and its lock is
+def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -> None:
+    """Execute unfinished tracks of one family; afterwards each has finished or has an error, and its lock is
     released."""
-    parties = [tracks] if tracks else []
-    party: Sequence[Track] = ()
+    party = [track for track in tracks if track.open]
+    parties, cache = [party] if party else [], cache or SimulatorCache()
     try:
         while parties:
             party = parties.pop(0)
@@ -105,11 +105,18 @@ def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) ->
                 kind = own.runner_type()
                 if not issubclass(kind, Runner):
                     raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
-                groups = _groups(party, own)
+                # Executed alone, all together, or with those at the same iteration.
+                groups: dict[int, list[Track]] = defaultdict(list)
+                for number, track in enumerate(party):
+                    groups[number if not own.batching else track.iteration if own.in_step else 0].append(
+                        track
+                    )
                 if len(groups) == 1:
                     kind(party, note, cache).run()
                 else:
-                    parties[:0] = groups
+                    parties[:0] = (
+                        [groups[key] for key in sorted(groups)] if own.batching else [*groups.values()]
+                    )
             except TogetherError:
                 left = [track for track in party if track.open]
                 half = len(left) if len(left) < len(party) else len(left) // 2
@@ -130,14 +137,3 @@ def _execute_batch(tracks: Sequence[Track], note: str, cache: SimulatorCache) ->
     finally:
         for track in tracks:
             track.run.release()
-
-
-def _groups(tracks: Sequence[Track], own: Family) -> list[Sequence[Track]]:
-    """Return groups of runs that can be executed together: each alone, all, or those at the same
-    iteration."""
-    if not own.batching:
-        return [[track] for track in tracks]
-    if not own.in_step:
-        return [tracks]
-    stand = sorted({track.iteration for track in tracks})
-    return [[track for track in tracks if track.iteration == iteration] for iteration in stand]

@@ -20,7 +20,7 @@ import numpy as np
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family, family
 from plab.plugins import torch
-from plab.runners.planners.planner import (
+from plab.runners.planner import (
     Asking,
     CandidateStart,
     Planner,
@@ -98,14 +98,6 @@ class GradientPlanner(Planner):
         return torch.as_tensor(self._rule.actions, device=self.start.device)[None]
 
 
-class Replanning(CandidateStart):
-    """Random starts during an episode, because contact starts only apply at its beginning."""
-
-    def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
-        """Draw candidates, shape [count, T, A]."""
-        return super().draw(replace(method, contact_starts=0.0), count, random)
-
-
 class MpcRunner(PlannerRunner):
     """Runner of model-predictive control; each iteration plans and executes some steps.
 
@@ -117,7 +109,6 @@ class MpcRunner(PlannerRunner):
         """Make the problem, with an environment per candidate."""
         super().build()
         self._beginning = self._current_state()
-        (self._track,) = self.tracks
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Begin the episode, or repeat the steps in the file."""
@@ -125,7 +116,7 @@ class MpcRunner(PlannerRunner):
         self._found: Tensor | None = None
         self._terms: list[np.ndarray] = []
         self._first_loss = float(self.problem.loss_of(self.problem.simulator.measure().terms)[0])
-        self._go_to(self._beginning)
+        self.problem.simulator.set_initial_state(self._beginning)
         if state is not None:
             self._execute(np.array(state["executed"]))
             if "found" in state:
@@ -140,26 +131,24 @@ class MpcRunner(PlannerRunner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
-        begin, track, method = time.perf_counter(), self._track, self.method
+        begin, method, (track,) = time.perf_counter(), self.method, self.tracks
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)
-        kind = Replanning if taken else CandidateStart
-        start = kind(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
-        gradient = isinstance(method.planner, TrajectoryConfig)
-        planner = GradientPlanner(method.planner, start) if gradient else make_planner(method.planner, start)
+        start = CandidateStart(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
+        own: Any = method.planner
+        spent = np.zeros(2, int)
+        if isinstance(method.planner, TrajectoryConfig):
+            planner: Planner = GradientPlanner(own, start)
+        else:
+            # Contact starts only apply at the beginning of the episode.
+            planner = make_planner(replace(own, contact_starts=0.0) if taken else own, start)
         found = None if self._found is None else self._found[:, :ahead]
-        spent = {True: 0, False: 0}
-        for number in range(method.planner.iterations):
-            asking, answer = planner.plan(self._numbers(number), found if number == 0 else None), None
-            try:
-                while True:
-                    request = next(asking) if answer is None else asking.send(answer)
-                    spent[request.gradient] += request.actions.shape[0] * ahead
-                    answer = self._try({track: request})[track]
-                    if not track.open:
-                        return
-            except StopIteration:
-                pass
+        for number in range(own.iterations):
+            random = self.random(track.cfg.seed, track.iteration, number)
+            _, steps = self.drive({track: planner.plan(random, found if number == 0 else None)})
+            spent += steps[track]
+            if not track.open:
+                return
         plans = planner.found()
         share = plans[0, : method.execute].cpu().numpy()
         self._execute(share)
@@ -175,8 +164,8 @@ class MpcRunner(PlannerRunner):
             self.problem.totals(terms, loss, self._first_loss, iou),
             actions,
             state,
-            steps_forward=spent[False] + len(share),
-            steps_gradient=spent[True],
+            steps_forward=int(spent[0]) + len(share),
+            steps_gradient=int(spent[1]),
             seconds=time.perf_counter() - begin,
             whole=len(self._executed) == scene.horizon,
         )
@@ -185,18 +174,12 @@ class MpcRunner(PlannerRunner):
     def close(self) -> None:
         """Return to the initial state for the evaluation."""
         if hasattr(self, "_beginning"):
-            self._go_to(self._beginning)
+            self.problem.simulator.set_initial_state(self._beginning)
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Report the progress of the episode."""
         text = f"step {len(self._executed)} hard score {rows[0]['score']:.3f}"
-        self.report(self._track.iteration, text)
-
-    def _numbers(self, number: int) -> torch.Generator:
-        """Return the random generator of an iteration of the plan, reproducible when resuming."""
-        key = [self._track.cfg.seed, self._track.iteration, number]
-        seed = np.random.SeedSequence(key).generate_state(1, np.uint64)[0]
-        return torch.Generator(self._device).manual_seed(int(seed) >> 1)
+        self.report(tracks[0].iteration, text)
 
     def _execute(self, actions: np.ndarray) -> None:
         """Execute actions of shape [k, A] in the hard contact model, and plan from the resulting state."""
@@ -205,16 +188,13 @@ class MpcRunner(PlannerRunner):
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)
         self._terms += list(done.step_terms[0])
         self._executed = np.concatenate([self._executed, actions])
-        self._go_to(self._current_state())
+        self.problem.simulator.set_initial_state(self._current_state())
 
     def _current_state(self) -> State:
         """Return the state of the first environment, for all of them."""
         state = self.problem.simulator.state()
         arrays = {name: own for name, own in vars(state).items() if own is not None}
         return replace(state, **{name: np.repeat(own[:1], len(own), axis=0) for name, own in arrays.items()})
-
-    def _go_to(self, state: State) -> None:
-        self.problem.simulator.set_initial_state(state)
 
 
 FAMILY = Family(

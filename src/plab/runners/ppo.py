@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 from plab.config import Config, ConfigError, ranges
 from plab.plugins import torch
-from plab.runners.agents import Agents, RlConfig
-from plab.runners.networks import adam, descend, linear, mlp, require_capturable
+from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp, require_capturable
 from plab.runners.policy import CLIP, EPSILON, Moments, Spaces
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from plab.errors import PlabError, out_of_memory
 from plab.objective import chamfer_distance, earth_movers_distance
 from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import ResultsError, row_count
-from plab.runners.tracks import RunError, Step, TogetherError, Track, batch_title
+from plab.runners.tracks import RunError, Step, TogetherError, Track, title
 
 if TYPE_CHECKING:
     from plab.problem import Episodes, Problem
@@ -71,11 +71,7 @@ class Runner:
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
-        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`.
-
-        Raises:
-            NotImplementedError: Unless a subclass overrides it.
-        """
+        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`."""
         raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
@@ -107,7 +103,6 @@ class Runner:
         Raises:
             plab.sim.SimulationError: If a state, loss or gradient diverges.
             plab.runners.RunError: If it fails for another reason.
-            NotImplementedError: Unless a subclass overrides this or :meth:`iterate`.
         """
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
@@ -161,8 +156,7 @@ class Runner:
         scene = self.problem.scenes[0]
         return np.zeros((len(self.tracks), scene.horizon, scene.action_dim))
 
-    # ----------------------------------------------------------------------------------------- shared
-    # implementation
+    # ------------------------------------------------------------------------------- shared implementation
 
     def run(self) -> None:
         """Execute the runs; a failed run does not affect the others.
@@ -192,7 +186,8 @@ class Runner:
                     raise
                 for track in self.tracks:
                     self._start(track)
-                self._optimise()
+                with self._progress("", *self.extent()) as self.report:
+                    self._iterate_all()
             finally:
                 self.enter("")
                 self.close()
@@ -200,18 +195,13 @@ class Runner:
                 self._conclude()
 
     def _progress(
-        self, what: str = "", done: int = 0, total: int | None = None, every: int = PLAIN_EVERY
+        self, what: str, done: int = 0, total: int | None = None, every: int = PLAIN_EVERY
     ) -> AbstractContextManager[Report]:
         from plab.sim.compiler import watch_compiling
 
-        return show_progress(
-            f"{self._note}{batch_title([track.cfg for track in self.tracks])}{what}",
-            done,
-            total,
-            enabled=self.tracks[0].cfg.progress,
-            plain_every=every,
-            compiling=watch_compiling,
-        )
+        cfgs = [track.cfg for track in self.tracks]
+        options: dict[str, Any] = {"enabled": cfgs[0].progress, "compiling": watch_compiling}
+        return show_progress(f"{self._note}{title(*cfgs)}{what}", done, total, plain_every=every, **options)
 
     def _start(self, track: Track) -> None:
         """Start a run, or resume it from its file; reject a state that does not fit this run."""
@@ -225,39 +215,32 @@ class Runner:
             if result.resume is None or isinstance(error, PlabError):
                 raise
             # Of NumPy or torch, at a state of other arrays.
-            reason, file = " ".join(str(error).split()), track.run.partial_path
-            track.fail(
-                ResultsError(f"{file} cannot be gone on from: {reason[:300]}; start afresh with force=true")
-            )
+            reason, file = " ".join(str(error).split())[:300], track.run.partial_path
+            track.fail(ResultsError(f"{file} cannot be gone on from: {reason}; start afresh with force=true"))
 
-    def _optimise(self) -> None:
+    def _iterate_all(self) -> None:
         # The first rollout of a process compiles the kernels.
-        phase = "compile"
-        with self._progress("", *self.extent()) as self.report:
-            columns = (*episode_columns(self.problem.term_names), *self._family.columns)
-            while active := [track for track in self.tracks if track.open and self.has_more(track)]:
-                self.enter(phase, active)
-                rows, start = [], time.perf_counter()
-                with simulation_errors(f"iteration {active[0].iteration}: "):
-                    for track, step in self.iterate(active):
-                        if step.seconds is None:
-                            step = replace(step, seconds=time.perf_counter() - start)
-                        try:
-                            rows.append(track.record(step, columns))
-                        except ResultsError as error:
-                            track.fail(error)
-                        start = time.perf_counter()
-                phase = "optimise"
-                if rows:
-                    self.tell(rows, active)
+        phase, columns = "compile", (*episode_columns(self.problem.term_names), *self._family.columns)
+        while active := [track for track in self.tracks if track.open and self.has_more(track)]:
+            self.enter(phase, active)
+            rows, start = [], time.perf_counter()
+            with simulation_errors(f"iteration {active[0].iteration}: "):
+                for track, step in self.iterate(active):
+                    if step.seconds is None:
+                        step = replace(step, seconds=time.perf_counter() - start)
+                    with track.results_errors():
+                        rows.append(track.record(step, columns))
+                    start = time.perf_counter()
+            phase = "optimise"
+            if rows:
+                self.tell(rows, active)
 
     def _conclude(self) -> None:
         """Evaluate the best actions in the hard contact model, and finish the files."""
-        for track in (one for one in self.tracks if one.open):
-            try:
-                self.conclude(track)
-            except ResultsError as error:
-                track.fail(error)
+        for track in self.tracks:
+            if track.open:
+                with track.results_errors():
+                    self.conclude(track)
         left = [track for track in self.tracks if track.open]
         if not left:
             return
@@ -269,28 +252,21 @@ class Runner:
             episodes = self.judge(best)
         self.enter("")
         for track in left:
-            self._finish(track, episodes)
-
-    def _finish(self, track: Track, episodes: Episodes) -> None:
-        number = track.number
-        if number in episodes.failures:
-            track.fail(RunError(f"final evaluation: {episodes.failures[number]}"))
-            return
-        masses = {
-            "initial": self.problem.initial_mass,
-            "final": cast(np.ndarray, episodes.final_mass),
-            "target": self.problem.target_mass,
-        }
-        pair = masses["final"][number], masses["target"][number]
-        distances = {"chamfer": chamfer_distance(*pair), "earth_movers": earth_movers_distance(*pair)}
-        judged = measures(episodes, number) | distances
-        try:
-            # After the last row, which counts the steps before it.
-            steps = int(track.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
-            track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
-            track.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
-        except ResultsError as error:
-            track.fail(error)
+            number = track.number
+            if number in episodes.failures:
+                track.fail(RunError(f"final evaluation: {episodes.failures[number]}"))
+                continue
+            own = self.problem.initial_mass, cast(np.ndarray, episodes.final_mass), self.problem.target_mass
+            initial, final, target = (mass[number] for mass in own)
+            judged = measures(episodes, number) | {
+                "chamfer": chamfer_distance(final, target),
+                "earth_movers": earth_movers_distance(final, target),
+            }
+            with track.results_errors():
+                # After the last row, which counts the steps before it.
+                steps = int(track.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
+                track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
+                track.run.finish(judged, {"initial": initial, "final": final, "target": target})
 
 
 # ----------------------------------------------------------------------------------- simulators and measures

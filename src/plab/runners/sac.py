@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 from plab.config import Config
 from plab.plugins import torch
-from plab.runners.agents import OffPolicyAgents, OffPolicyConfig
-from plab.runners.networks import adam, descend, follow, linear, mlp, twin_values
+from plab.runners.agents import (
+    OffPolicyAgents,
+    OffPolicyConfig,
+    adam,
+    descend,
+    follow,
+    linear,
+    mlp,
+    twin_values,
+)
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:

@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 from plab.config import Config, ranges
 from plab.plugins import torch
-from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, Samples
-from plab.runners.networks import adam, descend, follow, mlp, twin_values
+from plab.runners.agents import (
+    OffPolicyAgents,
+    OffPolicyConfig,
+    Samples,
+    adam,
+    descend,
+    follow,
+    mlp,
+    twin_values,
+)
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:

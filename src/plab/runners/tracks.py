@@ -6,8 +6,8 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -30,13 +30,12 @@ class TogetherError(RuntimeError):
     others must restart without it."""
 
 
-def is_refusal(error: Exception) -> bool:
+def _is_refusal(error: Exception) -> bool:
     """Return True if the user can correct an error: invalid input, or an unusable file."""
     return isinstance(error, PlabError) and error.exit_code == PlabError.exit_code
 
 
-def describe(error: Exception) -> str:
-    """Return an error's message; for a bug, with its type."""
+def _describe(error: Exception) -> str:
     return str(error) if isinstance(error, PlabError) else f"{type(error).__name__}: {error}"
 
 
@@ -86,6 +85,7 @@ class Track:
         best_loss: Loss of the best actions so far, NaN before the first iteration.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
+        contact: Contact model of the rows.
         log: Log of rows and further numbers, selected by ``logger``.
     """
 
@@ -93,13 +93,13 @@ class Track:
         """Resume a run from its file."""
         self.cfg, self.run, self.number = cfg, run, 0
         self.error: Exception | None = None
-        self.finished_before = run.finished
-        self.log = RunLog(cfg, run)
+        self.finished_before, self.log = run.finished, RunLog(cfg, run)
         result = run.result
         columns, rows = result.columns, result.rows
-        self.iteration, self.best_loss = rows, result.best_loss
-        self.best_actions = result.best_actions
-        self._by_score = family(cfg.method.family).ranking == "score"
+        self.iteration, self.best_loss, self.best_actions = rows, result.best_loss, result.best_actions
+        own = family(cfg.method.family)
+        self.contact = own.contact or cfg.method.contact
+        self._by_score = own.ranking == "score"
         known = self._by_score and result.best_iteration >= 0
         self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
         self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
@@ -114,21 +114,15 @@ class Track:
         """Return True if the run ranks actions by score and has reached the highest score."""
         return self._best_score >= SOLVED
 
-    @property
-    def contact(self) -> str:
-        """Contact model of its rows."""
-        return family(self.cfg.method.family).contact or self.cfg.method.contact
-
     def outcome(self) -> Outcome:
         """Return the outcome of the run."""
-        error = self.error
-        if error is None:
+        if (error := self.error) is None:
             status = "before" if self.finished_before else "finished"
             return Outcome.of(self.cfg, status, self.run.result.score)
-        what = describe(error)
+        what = _describe(error)
         if not (isinstance(error, PlabError) or traceback_wanted()):
             what += f"; a bug: {TRACEBACK}=1 shows where"
-        return Outcome.of(self.cfg, "refused" if is_refusal(error) else "failed", message=what)
+        return Outcome.of(self.cfg, "refused" if _is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
         """Mark the run as failed, also in its file, which keeps the results so far; the rest of the batch
@@ -140,14 +134,22 @@ class Track:
             why: An error, or the reason of the failure in the current iteration.
         """
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
-        if isinstance(error, ResultsError) or (is_refusal(error) and not self.run.advanced):
+        if isinstance(error, ResultsError) or (_is_refusal(error) and not self.run.advanced):
             # After a ResultsError nothing can be written to the file.
             self.run.discard()
-        elif self.run.result.rows or not is_refusal(error):
+        elif self.run.result.rows or not _is_refusal(error):
             try:
-                self.run.close("failed", describe(error))
+                self.run.close("failed", _describe(error))
             except ResultsError as another:
                 self.error = another
+
+    @contextmanager
+    def results_errors(self) -> Iterator[None]:
+        """Fail if the block cannot read or write a file of the run."""
+        try:
+            yield
+        except ResultsError as error:
+            self.fail(error)
 
     def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
         """Write an iteration to the file; return its row.
@@ -162,12 +164,11 @@ class Track:
         horizon, before = len(step.actions), sum(self._budget.values())
         episodes = before // horizon if step.episodes is None else step.episodes
         steps = episodes * horizon if step.steps is None else step.steps
-        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
         forward = horizon if step.steps_forward is None else step.steps_forward
-        spent = dict(zip(BUDGETS, (forward, step.steps_gradient), strict=True))
-        self._budget = {name: known + spent[name] for name, known in self._budget.items()}
-        row |= self._budget
-        row |= {name: step.measures[name] for name in columns}
+        spent = zip(self._budget.items(), (forward, step.steps_gradient), strict=True)
+        self._budget = {name: known + more for (name, known), more in spent}
+        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
+        row |= self._budget | {name: step.measures[name] for name in columns}
         row["seconds"] = cast(float, step.seconds)
         # The first loss must beat NaN, which stands for none.
         better = not row["loss"] >= self.best_loss
@@ -177,29 +178,20 @@ class Track:
         chosen = (step.actions, self.iteration, row["loss"]) if better and step.whole else step.best
         best: dict[str, Any] = {}
         if chosen is not None:
-            self.best_actions, iteration, self.best_loss = chosen
-            self._best_score = row["score"]
-            best = {
-                "best_actions": self.best_actions,
-                "best_iteration": iteration,
-                "best_loss": self.best_loss,
-            }
+            best = dict(zip(("best_actions", "best_iteration", "best_loss"), chosen, strict=True))
+            (self.best_actions, _, self.best_loss), self._best_score = chosen, row["score"]
         self.run.record(row, step.state, keep=step.keep, **best)
         self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
         self.iteration += 1
         return row
 
 
-def title(cfg: Config) -> str:
-    """Return task, variant, method and seed."""
-    return f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
-
-
-def batch_title(cfgs: Sequence[Config]) -> str:
-    """Return the task and number of runs of a batch, or the title of a single run."""
-    if len(cfgs) == 1:
-        return title(cfgs[0])
-    return f"{cfgs[0].task.name}, {len(cfgs)} runs"
+def title(*cfgs: Config) -> str:
+    """Return task, variant, method and seed of a run, or the task and number of runs of a batch."""
+    first, count = cfgs[0], len(cfgs)
+    if count > 1:
+        return f"{first.task.name}, {count} runs"
+    return f"{first.task.name}-v{first.variant} {first.method.name} seed {first.seed}"
 
 
 _UNFINISHED = {"elsewhere": "under way in another process", "lost": "not under way"}
@@ -268,13 +260,9 @@ class RunLog:
     def __init__(self, cfg: Config, run: RunFile) -> None:
         """Keep the run's configuration and file."""
         self._cfg, self._run = cfg, run
+        self.wanted = cfg.logger != "none"
         self._write: Callable[[Mapping[str, float], int], object] | None = None
         self._close: Callable[[], object] = lambda: None
-
-    @property
-    def wanted(self) -> bool:
-        """Return whether the run has a logger."""
-        return self._cfg.logger != "none"
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
         """Log numbers by name at an environment step, leaving out non-finite ones; ResultsError if that
@@ -312,7 +300,7 @@ class RunLog:
 
         return write, writer.close
 
-    def _wandb(self, steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
+    def _wandb(self, _steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
         """Begin a run at Weights & Biases, or go on with that of the same configuration; its own files are in
         the folder ``wandb`` of ``results_dir``, and ``WANDB_MODE`` and wandb's other variables apply."""
         import wandb

@@ -22,7 +22,6 @@ from plab.config import Config, ConfigError
 from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
 from plab.plugins import torch
-from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.policy import Moments, PolicyConfig, save_policy, torch_settings
 from plab.runners.runner import (
@@ -240,7 +239,7 @@ class PolicyRunner(Runner):
     _pace = 0.0
     _shown = ""
 
-    def _kind(self) -> type[Training]:
+    def _kind(self) -> type[Any]:
         return self.training or self._family.rules[self.method.algorithm].what
 
     def context(self) -> AbstractContextManager[Any]:
@@ -272,10 +271,8 @@ class PolicyRunner(Runner):
             return
         self.policies.restore(track.number, state)
         if self.has_more(track) and (found := self.policies.replay(track.number)):
-            try:
+            with track.results_errors():
                 found[0].read(found[1], _replay_path(track), self.policies.steps)
-            except ResultsError as error:
-                track.fail(error)
 
     def has_more(self, track: Track) -> bool:
         """Return whether training steps remain, or the initial policy has not been evaluated."""
@@ -312,12 +309,11 @@ class PolicyRunner(Runner):
             if why := _unusable(track, own, done):
                 track.fail(why)
                 continue
-            try:
+            with track.results_errors():
                 if found := training.replay(track.number):
                     found[0].write(found[1], _replay_path(track))
                 track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, training.steps)
-            except ResultsError as error:
-                track.fail(error)
+            if not track.open:
                 continue
             step = Step(
                 done.measures | own.measures,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from plab.problem import Episodes
     from plab.scenes import Scene
+
 OBJECTIVES = ("loss", "final", "score")
 
 
@@ -98,7 +100,8 @@ class Answer:
         return torch.where(self.broken, torch.inf, cost)
 
 
-Asking: TypeAlias = "Generator[Request, Answer, tuple[Tensor, dict[str, float]]]"
+Shown: TypeAlias = "tuple[Tensor, dict[str, float]]"
+Asking: TypeAlias = "Generator[Request, Answer, Shown]"
 """Iteration of a planner: requests that are answered, and at last the best candidate's actions in [-1, 1],
 shape [T, A], and its measures."""
 
@@ -113,7 +116,7 @@ class CandidateStart:
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
         """Keep scene and target, a mass tensor of shape [n, n, n]."""
-        from plab.runners.planners.contact_starts import ContactStarts
+        from plab.runners.contact_starts import ContactStarts
 
         self.shape, self.device = (scene.horizon, scene.action_dim), device
         self._contact = ContactStarts(scene, target)
@@ -174,7 +177,7 @@ class Planner(ABC):
         self.iteration += 1
         return shown
 
-    def show(self, actions: Tensor, answer: Answer) -> tuple[Tensor, dict[str, float]]:
+    def show(self, actions: Tensor, answer: Answer) -> Shown:
         """Return the best of some candidates and its measures, given their evaluation in the hard contact
         model."""
         cost = answer.cost("score")
@@ -285,8 +288,8 @@ class PlannerRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the run's planner, or restore it from the file."""
-        number = track.number
-        start = CandidateStart(self.problem.scenes[number], self.problem.target_mass[number], self._device)
+        number, problem = track.number, self.problem
+        start = CandidateStart(problem.scenes[number], problem.target_mass[number], self._device)
         planner = self._planners[number] = make_planner(track.cfg.method, start)
         if state is not None:
             planner.restore(state)
@@ -298,22 +301,8 @@ class PlannerRunner(Runner):
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Make one iteration of the planners of all runs."""
         begin = time.perf_counter()
-        spent = {track: {False: 0, True: 0} for track in tracks}
-        asking = {track: self._planners[track.number].plan(self._random(track)) for track in tracks}
-        pending = {track: next(walk) for track, walk in asking.items()}
-        shown: dict[Track, tuple[Tensor, dict[str, float]]] = {}
-        while pending:
-            first = next(iter(pending.values()))
-            kind = first.gradient, first.actions.shape
-            together = {t: r for t, r in pending.items() if (r.gradient, r.actions.shape) == kind}
-            for track, answer in self._try(together).items():
-                request = pending.pop(track)
-                spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
-                try:
-                    if track.open:
-                        pending[track] = asking[track].send(answer)
-                except StopIteration as stop:
-                    shown[track] = stop.value
+        walks = {t: self._planners[t.number].plan(self.random(t.cfg.seed, t.iteration)) for t in tracks}
+        shown, spent = self.drive(walks)
         share = (time.perf_counter() - begin) / len(tracks)
         for track, (actions, measured) in shown.items():
             step = Step(
@@ -326,13 +315,36 @@ class PlannerRunner(Runner):
             )
             yield track, step
 
+    def drive(self, walks: Mapping[Track, Asking]) -> tuple[dict[Track, Shown], dict[Track, list[int]]]:
+        """Make iterations of planners, evaluating their candidates together.
+
+        Returns:
+            Best candidates and their measures, of the runs that have not failed; and environment steps of
+            all, without and with gradient.
+        """
+        spent, shown = {track: [0, 0] for track in walks}, dict[Track, Shown]()
+        pending = {track: next(walk) for track, walk in walks.items()}
+        while pending:
+            first = next(iter(pending.values()))
+            kind = first.gradient, first.actions.shape
+            together = {t: r for t, r in pending.items() if (r.gradient, r.actions.shape) == kind}
+            for track, answer in self._try(together).items():
+                request = pending.pop(track)
+                spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
+                try:
+                    if track.open:
+                        pending[track] = walks[track].send(answer)
+                except StopIteration as stop:
+                    shown[track] = stop.value
+        return shown, spent
+
     def judge(self, actions: np.ndarray) -> Episodes:
         """Run the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
         return super().judge(np.concatenate([actions] * self._width))
 
-    def _random(self, track: Track) -> torch.Generator:
-        """Return the random generator of a run's next iteration, reproducible when resuming."""
-        seed = np.random.SeedSequence([track.cfg.seed, track.iteration]).generate_state(1, np.uint64)[0]
+    def random(self, *key: int) -> torch.Generator:
+        """Return the random generator of an iteration, reproducible when resuming."""
+        seed = np.random.SeedSequence(key).generate_state(1, np.uint64)[0]
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
@@ -349,8 +361,16 @@ class PlannerRunner(Runner):
             softness[track.number] = request.softness or 0.0
         models = np.where(softness > 0, "soft", "hard")
         self.problem.simulator.set_contact(list(models) * width, np.tile(softness, width).tolist())
-        parts = [self._totals(part, first.gradient, reasons) for part in tried.split(width)]
-        whole = {name: torch.cat([part[name] for part in parts])[:count] for name in parts[0]}
+        parts: dict[str, list[Tensor]] = defaultdict(list)
+        for part in tried.split(width):
+            trials = self.problem.try_out(part.flatten(0, 1), gradient=first.gradient)
+            broken = torch.zeros(part.shape[:2].numel(), dtype=torch.bool, device=self._device)
+            broken[list(trials.failures)] = True
+            reasons |= {e % len(self.tracks): text for e, text in trials.failures.items()}
+            given = trials.measures | {"final": trials.final_loss, "broken": broken}
+            for name, values in (given | ({"gradient": trials.gradient} if first.gradient else {})).items():
+                parts[name].append(torch.as_tensor(values).reshape(*part.shape[:2], *values.shape[1:]))
+        whole = {name: torch.cat(rows)[:count] for name, rows in parts.items()}
         answers = {}
         for track in requests:
             own = {name: values[:, track.number] for name, values in whole.items()}
@@ -361,21 +381,6 @@ class PlannerRunner(Runner):
             if bool(broken.all()):
                 track.fail(f"none of {count} candidates came through; {reasons[track.number]}")
         return answers
-
-    def _totals(self, tried: Tensor, gradient: bool, reasons: dict[int, str]) -> dict[str, Tensor]:
-        """Return results of candidates by name, shape [candidate, run, ...] all; ``reasons`` gets one per
-        run with failures."""
-        trials, runs = self.problem.try_out(tried.flatten(0, 1), gradient=gradient), len(self.tracks)
-        broken = torch.zeros(len(tried) * runs, dtype=torch.bool, device=self._device)
-        broken[list(trials.failures)] = True
-        reasons |= {e % runs: text for e, text in trials.failures.items()}
-        given = trials.measures | {"final": trials.final_loss, "broken": broken}
-        if gradient:
-            given["gradient"] = trials.gradient
-        return {
-            name: torch.as_tensor(values).reshape(len(tried), runs, *values.shape[1:])
-            for name, values in given.items()
-        }
 
 
 def _smallest_population(method: Any) -> int:

@@ -21,8 +21,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import ConfigError, ranges
+from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.planners.planner import Asking, CandidateStart, Planner, PlannerConfig, Request
+from plab.runners.planner import (
+    Asking,
+    CandidateStart,
+    Planner,
+    PlannerConfig,
+    PlannerRunner,
+    Request,
+    Stages,
+    StagesConfig,
+)
 from plab.runners.policy import packed, unpacked
 
 if TYPE_CHECKING:
@@ -382,3 +392,28 @@ class Cmaes(Sampler):
         self.recentre(self.memory["best"])
         held = {name: np.asarray(value)[()] for name, value in state["search"].items()}
         self._search.__setstate__(self._search.__getstate__() | held)
+
+
+FAMILY = Family(
+    label="a sequence of actions, searched for with many candidates",
+    config=PlannerConfig,
+    runner=PlannerRunner,
+    ranking="score",
+    batching=True,
+    contact="hard",
+    rules={
+        "multistart": Rule(Multistart, MultistartConfig),
+        "cem": Rule(Cem, CemConfig),
+        "mppi": Rule(Mppi, MppiConfig),
+        "cmaes": Rule(Cmaes, CmaesConfig),
+        "stages": Rule(Stages, StagesConfig),
+    },
+    methods={
+        "multistart": Appearance("Multistart", "#6699CC"),
+        "cem": Appearance("CEM", "#117733", "--"),
+        "mppi": Appearance("MPPI", "#44AA99", "-."),
+        "cmaes": Appearance("CMA-ES", "#882255"),
+        "hybrid": Appearance("Hybrid", "#AA4499", "--"),
+        "solve": Appearance("Solve", "#332288"),
+    },
+)
