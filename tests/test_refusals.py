@@ -135,7 +135,6 @@ ARCHIVE = "a.plab.zip.xz"
 TOOLS = [
     (results.main, f"pack nowhere --output {ARCHIVE}", "nowhere"),
     (results.main, f"pack . colour=red --output {ARCHIVE}", "colour=red"),
-    (results.main, f"pack . status=done --output {ARCHIVE}", "running, finished"),
     (results.main, "pack .", "--output"),
     (results.main, "pack . --output a.txt", "a.txt"),
     (results.main, "unpack nowhere.plab.zip.xz --output b", "nowhere.plab.zip.xz"),
@@ -147,7 +146,6 @@ TOOLS = [
     (render, "a.h5 task=Rope", "task=Rope"),
     (render, "task=Rope --output a.avi", "a.avi"),
     (render, "task=Rope targets.source=nowhere", "nowhere"),
-    (render, "task=Rope --contact-sheet a.png", "task=Rope"),
     (view, "nowhere.h5", "nowhere.h5"),
     (view, "--gallery task=Rope", "task=Rope"),
     (view, "task=Rope --output a.htm", "a.htm"),

@@ -27,22 +27,17 @@ from plab.render.graphics import RenderError, require_graphics, require_packages
 if TYPE_CHECKING:
     from plab.config import Config
 
-_FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
-"""Sizes of a film's frame, a cell of the contact sheet, and a frame of the film strip [pixels]."""
-
 _MAX_FRAME_SIZE = 4096
 """Largest frame width and height [pixels], supported by all OpenGL versions and by H.264."""
 
 
 @command_line
 def render(argv: Sequence[str]) -> None:
-    """Draw a run's best actions, the best known actions for a task, or all tasks.
+    """Draw a run's best actions, or the best known actions for a task.
 
     plab render RESULT_FILE [--output FILE]
     plab render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
     plab render KEY=VALUE ... [--output FILE]
-    plab render --contact-sheet FILE [KEY=VALUE ...]     start and target of every task and variant
-    plab render --film-strip FILE [KEY=VALUE ...]        frames of the best known actions for every task
 
     Of folders and archives it takes the run with the highest score. The suffix of FILE selects the output:
       .png         start, target and the rollout's end, side by side
@@ -54,42 +49,20 @@ def render(argv: Sequence[str]) -> None:
       plab render task=Torus variant=2 --output torus.gif
     """
     parser = _parser("plab render", render.__doc__, "a film")
-    add = parser.add_argument
-    add(
-        "--output",
-        type=folder,
-        metavar="FILE",
-        help="output file (default: a .png named after the result or the task)",
-    )
-    add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
-    add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
-    add("--size", type=_size, metavar="WxH", help="size of a frame or cell in pixels (default: 480x360)")
+    what = "output file (default: a .png named after the result or the task)"
+    parser.add_argument("--output", type=folder, metavar="FILE", help=what)
+    what = "size of a frame in pixels (default: 480x360)"
+    parser.add_argument("--size", type=_size, default=(480, 360), metavar="WxH", help=what)
     options = parser.parse_intermixed_args(argv)
-    if options.contact_sheet and options.film_strip:
-        parser.error("give either --contact-sheet or --film-strip")
-    if path := options.contact_sheet or options.film_strip:
-        suffix = ".png" if options.contact_sheet else ".jpg"
-        if path.suffix.lower() != suffix:
-            raise RenderError(f"cannot write {path}: it must be a {suffix}")
-        own = ("task=", "variant=") if options.contact_sheet else ("task=",)
-        _refuse_choice(options, own)
-    else:
-        path = resolve_rollout(options, ".png")
+    path = resolve_rollout(options, ".png")
     require_writable(path)
     require_graphics()
-    # Imported here, as below, because they load the simulator, which the checks above do not need.
+    # Imported here, as below, because it loads the simulator, which the checks above do not need.
     from plab.render import pictures
-    from plab.render.rollouts import demonstration, record, starts
+    from plab.render.rollouts import record
 
-    if options.contact_sheet:
-        rows = {task: starts(cfgs) for task, cfgs in _of_all_tasks(options, variants=True)}
-        pictures.save_contact_sheet(rows, path, options.size or _CELL)
-    elif options.film_strip:
-        films = [record(cfg, demonstration(cfg)) for _, (cfg,) in _of_all_tasks(options, variants=False)]
-        pictures.save_film_strip(films, path, options.size or _STRIP_FRAME)
-    else:
-        pictures.check_output(path)
-        pictures.save(record(*rollout(options)), path, options.size or _FRAME, options.every or 1)
+    pictures.check_output(path)
+    pictures.save(record(*rollout(options)), path, options.size, options.every or 1)
     print(path)
 
 
@@ -118,7 +91,8 @@ def view(argv: Sequence[str]) -> None:
     parser.add_argument("--surface", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     if options.gallery:
-        _refuse_choice(options, ("task=",))
+        if unwanted := [word for word in options.what if "=" not in word or word.startswith("task=")]:
+            raise ArgumentError(f"all tasks are shown: leave out '{unwanted[0]}'")
         output = (options.output or Path("gallery")) / "index.html"
     else:
         output = resolve_rollout(options, ".html")
@@ -132,7 +106,8 @@ def view(argv: Sequence[str]) -> None:
 
     if options.gallery:
         pages = []
-        for task, (cfg,) in _of_all_tasks(options, variants=False):
+        for task in (one for one in choices("task", options.config_dir) if one not in EXTENSION_TASKS):
+            cfg = load_config([f"task={task}", *options.what], options.config_dir)
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
             shown = page(recording, options.every, surface=options.surface)
             replace_file(output.with_name(file), shown)
@@ -250,29 +225,6 @@ def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
     if options.result:
         return rollouts.result(options.result)
     return options.config, rollouts.demonstration(options.config)
-
-
-# ------------------------------------------------------------------------------------- pictures of all tasks
-
-
-def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
-    """Reject results, and overrides of keys in ``own``, for a picture of all tasks."""
-    unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
-    if unwanted or (options.output and not getattr(options, "gallery", False)):
-        raise ArgumentError(f"all tasks are shown: leave out '{(*unwanted, '--output')[0]}'")
-
-
-def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[str, list[Config]]]:
-    """Return the configurations of every task of the suite, of all its variants or of the default one."""
-    from omegaconf import OmegaConf
-
-    found = []
-    tasks = choices("task", options.config_dir).items()
-    for task, path in (one for one in tasks if one[0] not in EXTENSION_TASKS):
-        own = [[f"variant={name}"] for name in OmegaConf.load(path).variants] if variants else [[]]
-        words = [[f"task={task}", *variant, *options.what] for variant in own]
-        found.append((task, [load_config(each, options.config_dir) for each in words]))
-    return found
 
 
 def _size(text: str) -> tuple[int, int]:

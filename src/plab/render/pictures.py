@@ -3,12 +3,9 @@ page."""
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -21,7 +18,7 @@ from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
-from plab.render.rollouts import RecordedRollout, record, record_all, result
+from plab.render.rollouts import RecordedRollout, record, result
 from plab.results import ResultsError
 from plab.scenes import SceneError
 from plab.sim import DeviceError, SimulationError
@@ -35,8 +32,6 @@ SUFFIXES = (".png", ".gif", ".mp4")
 
 _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
-_SHEET_COLORS = 256
-_STRIP_FRAMES = 4  # of a task in the film strip
 _SET_EVERY = 2  # environment steps from one frame to the next, of a set
 
 _PAGE_SIZE = (480, 360)
@@ -44,10 +39,6 @@ _RENDER_ERRORS = (
     *(RenderError, ResultsError, ConfigError, SceneError, TargetError),
     *(DeviceError, SimulationError),
 )
-
-
-Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
-"""By folder and picture name: result file, and whether to make a film."""
 
 
 def check_output(path: Path) -> None:
@@ -80,90 +71,34 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         write(recording, renderer, every, fresh)
 
 
-def save_set(
-    recordings: Mapping[str, RecordedRollout], folder: Path, size: tuple[int, int], filmed: Collection[str]
-) -> None:
-    """Write pictures of several rollouts of one configuration with a common camera.
-
-    Writes ``start.webp`` and ``target.webp``, for each rollout its last state as ``<name>.webp``, and of
-    some, where imageio-ffmpeg is installed, a film ``<name>.mp4``.
+def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *, film: bool) -> None:
+    """Write pictures of a rollout: ``start.webp``, ``target.webp`` and its last state ``end.webp``; and a
+    film ``end.mp4``, if wanted and imageio-ffmpeg is installed.
 
     Args:
-        recordings: The rollouts by name.
+        recording: The rollout.
         folder: Folder to write to.
         size: Width and height of a frame [pixels]; even numbers.
-        filmed: Names of the rollouts with a film.
+        film: Whether to write a film.
 
     Raises:
         RenderError: If a file cannot be written.
     """
-    shown = [*recordings.values()]
-    films = find_spec("imageio_ffmpeg") is not None
-    for name, one in recordings.items():
-        with _renderer(one, size, shown) as renderer, _writing(folder / name):
-            pictures = {name: renderer.frame(one.x[-1], one.poses[-1])}
-            if one is shown[0]:
-                pictures["start"] = renderer.frame(one.x[0], one.poses[0])
-                pictures["target"] = renderer.target(one.poses[0])
-            for what, picture in pictures.items():
-                Image.fromarray(picture).save(folder / f"{what}.webp", quality=86)
-            if films and name in filmed:
-                _save_mp4(one, renderer, _SET_EVERY, folder / f"{name}.mp4")
-
-
-def save_contact_sheet(
-    rows: Mapping[str, Sequence[RecordedRollout]], path: Path, size: tuple[int, int]
-) -> None:
-    """Write one picture of many tasks as PNG.
-
-    Args:
-        rows: One row per task with the initial state and the target of each variant.
-        path: File to write.
-        size: Width and height of a cell [pixels]; start and target share it.
-
-    Raises:
-        RenderError: If the file cannot be written.
-    """
-    tiles = []
-    for one in (recording for recordings in rows.values() for recording in recordings):
-        with _renderer(one, (size[0] // 2, size[1])) as renderer:
-            pair = renderer.frame(one.x[0], one.poses[0]), renderer.target(one.poses[0])
-        tiles.append((np.concatenate(pair, axis=1), f"{one.task}, variant {one.variant}"))
-    with _writing(path) as fresh:
-        sheet = _tiled(tiles, max(map(len, rows.values())))
-        _with_palette(sheet, _SHEET_COLORS).save(fresh, optimize=True)
-
-
-def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tuple[int, int]) -> None:
-    """Write one picture of many rollouts as JPEG: of each some frames, at equal distances in time.
-
-    Args:
-        recordings: The rollouts.
-        path: File to write.
-        size: Width and height of a frame [pixels].
-
-    Raises:
-        RenderError: If the file cannot be written.
-    """
-    tiles = []
-    for one in recordings:
-        steps = np.linspace(0, len(one.x) - 1, _STRIP_FRAMES).round().astype(int)
-        with _renderer(one, size) as renderer:
-            frames = [renderer.frame(one.x[step], one.poses[step]) for step in steps]
-        caption = f"{one.task}, variant {one.variant}: score {one.score:.2f}"
-        tiles.append((np.concatenate(frames, axis=1), caption))
-    with _writing(path) as fresh:
-        _tiled(tiles, 2).save(fresh, quality=88, optimize=True)
+    first, last = recording.poses[0], recording.poses[-1]
+    with _renderer(recording, size) as renderer, _writing(folder / "end"):
+        pictures = {"start": renderer.frame(recording.x[0], first), "target": renderer.target(first)}
+        pictures["end"] = renderer.frame(recording.x[-1], last)
+        for what, picture in pictures.items():
+            Image.fromarray(picture).save(folder / f"{what}.webp", quality=86)
+        if film and find_spec("imageio_ffmpeg") is not None:
+            _save_mp4(recording, renderer, _SET_EVERY, folder / "end.mp4")
 
 
 @contextmanager
-def _renderer(
-    recording: RecordedRollout, size: tuple[int, int], seen: Sequence[RecordedRollout] = ()
-) -> Iterator[Renderer]:
-    """Open a renderer of a rollout, with it or others of the same configuration in view."""
-    scene, mass, seen = recording.scene, recording.target_mass, seen or [recording]
-    x = np.concatenate([one.x[[0, -1]].reshape(-1, 3) for one in seen])
-    poses = np.concatenate([one.poses[::5] for one in seen])
+def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Renderer]:
+    """Open a renderer of a rollout, with all of it in view."""
+    scene, mass = recording.scene, recording.target_mass
+    x, poses = recording.x[[0, -1]].reshape(-1, 3), recording.poses[::5]
     with closing(Renderer(scene, mass, size, scene_camera(scene, mass, size, x, poses))) as renderer:
         yield renderer
 
@@ -193,7 +128,7 @@ def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path:
         (renderer.target(first), "target"),
         (renderer.frame(recording.x[-1], last), f"after {steps} steps: score {recording.score:.2f}"),
     ]
-    _tiled(panels, len(panels)).save(path, optimize=True)
+    tiled(panels, len(panels)).save(path, optimize=True)
 
 
 def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
@@ -235,7 +170,7 @@ def _with_palette(picture: Image.Image, colors: int) -> Image.Image:
     return picture.quantize(colors, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
 
 
-def _tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
+def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
     """Return pictures of one size in rows, each above its caption."""
     height, width, _ = tiles[0][0].shape
     text = max(12, height // 22)
@@ -252,12 +187,12 @@ def _tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image
 # ------------------------------------------------------------------------------------------------------ runs
 
 
-def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
-    """Render runs of many configurations, see :func:`save_set`; those with films first.
+def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None]) -> None:
+    """Render runs, see :func:`save_set`; those with films first.
 
     Args:
-        wanted: For each configuration the folder of its pictures, which must not exist and appears when it is
-            complete; and the pictures to draw.
+        wanted: By folder, which must not exist and appears when it is complete, a result file, and whether to
+            make a film.
         drawn: Called when a folder is complete.
 
     Raises:
@@ -270,34 +205,20 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
         # Leftover pictures of killed processes.
         for folder in place.glob(f"{UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
-    filmed = {folder: [n for n, (_, film) in files.items() if film] for folder, files in wanted.items()}
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
-        for number, folder in enumerate(sorted(wanted, key=lambda one: -len(filmed[one])), start=1):
+        for number, folder in enumerate(sorted(wanted, key=lambda one: not wanted[one][1]), start=1):
+            path, film = wanted[folder]
             try:
-                made = _replayed({name: path for name, (path, _) in wanted[folder].items()})
+                recording = record(*result(path))
             except _RENDER_ERRORS as error:
                 troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue
             with complete_folder(folder) as fresh:
-                save_set(made, fresh, _PAGE_SIZE, filmed[folder])
+                save_set(recording, fresh, _PAGE_SIZE, film=film)
             report(number, folder.name)
             drawn()
     if troubles:
         raise RenderError("; ".join(troubles))
-
-
-def _replayed(files: Mapping[str, Path]) -> dict[str, RecordedRollout]:
-    """Replay runs of one configuration by name; runs with the same settings share a simulator."""
-    found = {name: result(path) for name, path in files.items()}
-    alike: dict[str, list[str]] = defaultdict(list)
-    for name, (cfg, actions) in found.items():
-        sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-        alike[json.dumps([*sections, actions.shape])].append(name)
-    made: dict[str, RecordedRollout] = {}
-    for names in alike.values():
-        cfgs, actions = zip(*(found[name] for name in names), strict=True)
-        made |= zip(names, record_all(cfgs, np.stack(actions)), strict=True)
-    return {name: made[name] for name in files}
 
 
 def draw_strip(path: Path, picture: Path) -> None:

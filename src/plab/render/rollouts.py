@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -131,13 +130,8 @@ def demonstration(cfg: Config) -> np.ndarray:
 
 def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
-    return record_all([cfg], actions[None])[0]
-
-
-def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[RecordedRollout]:
-    """Simulate actions in [-1, 1], shape [batch, T, A], in configurations with one kind of scene."""
-    problem = Problem(cfgs)
-    return _recordings(cfgs, problem.scenes, problem.simulator, problem, actions)
+    problem = Problem([cfg])
+    return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions)
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
@@ -150,48 +144,40 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     except TargetError as error:
         print_once(f"without target and scores: {error}")
         scenes = build_scenes([cfg])
-        return _recordings([cfg], scenes, make_simulator(cfg, scenes), None, actions[None], motion=True)[0]
+        return _recording(cfg, scenes[0], make_simulator(cfg, scenes), None, actions, motion=True)
     if cfg.targets.source is not None:
         print_once(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
-    return _recordings([cfg], problem.scenes, problem.simulator, problem, actions[None], motion=True)[0]
+    return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions, motion=True)
 
 
-def starts(cfgs: Sequence[Config]) -> list[RecordedRollout]:
-    """Return rollouts without steps, for configurations with one kind of scene."""
-    return record_all(cfgs, np.zeros((len(cfgs), 0, build_scene(cfgs[0]).action_dim)))
-
-
-def _recordings(
-    cfgs: Sequence[Config],
-    scenes: Sequence[Scene],
+def _recording(
+    cfg: Config,
+    scene: Scene,
     simulator: Simulator,
     problem: Problem | None,
     actions: np.ndarray,
     *,
     motion: bool = False,
-) -> list[RecordedRollout]:
-    """Simulate actions, shape [batch, T, A], with targets and scores if there is a problem."""
-    names = ("x", "poses", *(("v", "F") if motion else ()))
+) -> RecordedRollout:
+    """Simulate actions, shape [T, A], with target and scores if there is a problem."""
     states, scores = [], []
     simulator.set_contact("hard")
     simulator.reset()
-    for step in range(actions.shape[1] + 1):
+    for step in range(len(actions) + 1):
         if step > 0:
-            simulator.step(actions[:, step - 1])
+            simulator.step(actions[None, step - 1])
         states.append(simulator.state())
         if problem is not None:
-            scores.append([one.score for one in problem.scores(simulator.mass_tensor())])
-    return [
-        RecordedRollout(
-            task=cfg.task.name,
-            variant=cfg.variant,
-            scene=scenes[number],
-            target_mass=None if problem is None else problem.target_mass[number],
-            scores=None if problem is None else np.array(scores)[:, number],
-            **{name: np.stack([getattr(state, name)[number] for state in states]) for name in names},
-        )
-        for number, cfg in enumerate(cfgs)
-    ]
+            scores.append(problem.scores(simulator.mass_tensor())[0].score)
+    names = ("x", "poses", *(("v", "F") if motion else ()))
+    return RecordedRollout(
+        task=cfg.task.name,
+        variant=cfg.variant,
+        scene=scene,
+        target_mass=None if problem is None else problem.target_mass[0],
+        scores=None if problem is None else np.array(scores),
+        **{name: np.stack([getattr(state, name)[0] for state in states]) for name in names},
+    )
 
 
 @functools.cache

@@ -125,14 +125,10 @@ class Page:
         html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
         replace_file(self._out / "index.html", html)
 
-    def missing_pictures(self) -> dict[Path, dict[str, tuple[Path, bool]]]:
-        """Return the folders of missing pictures, with result file and whether there is a film by stem."""
-        folders = {self._out / one.folder: one for one in self.shown}
-        return {
-            folder: {"end": (Path(one.run["path"]), one.film)}
-            for folder, one in folders.items()
-            if not folder.is_dir()
-        }
+    def missing_pictures(self) -> dict[Path, tuple[Path, bool]]:
+        """Return the folders of missing pictures, with result file and whether there is a film."""
+        folders = {self._out / one.folder: (Path(one.run["path"]), one.film) for one in self.shown}
+        return {folder: wanted for folder, wanted in folders.items() if not folder.is_dir()}
 
     def remove_surpassed(self) -> None:
         """Remove pictures of surpassed runs of configurations that have those of the best run."""
