@@ -24,22 +24,8 @@ from plab.results.running import lock_path
 from plab.runners import run_batch
 from plab.runners.tracks import Outcome
 from plab.sweep import gpus
-from plab.sweep.gpus import choose
 from same_runs import assert_same_numbers
 from toy_runner import COARSE, assert_complete, configs
-
-
-def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
-    waiting = [[load_config(["task=Move", "method=sac"])], [load_config(["task=Move"])]]
-    move, rope, writer = ((task, "trajectory") for task in ("Move", "Rope", "Writer"))
-    assert choose(waiting, None, [None]) == 0
-    assert choose(waiting, move, []) == 1
-    assert choose(waiting, None, [("Move", "rl")]) == 1
-    assert choose(waiting, None, [("Move", "rl"), move]) == 0
-    waiting = [[load_config([f"task={task}"])] for task in ("Move", "Rope", "Rope")]
-    assert choose(waiting, None, [move, writer]) == 1
-    assert choose(waiting, writer, [move, rope]) == 0
-    assert choose(waiting, None, [move, move, rope]) == 1
 
 
 @pytest.fixture

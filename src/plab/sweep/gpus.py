@@ -11,7 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 from plab import runners
 from plab.config import Config, ConfigError
@@ -19,35 +19,7 @@ from plab.runners.runner import SimulatorCache
 from plab.runners.tracks import Outcome
 from plab.sim.runtime import cuda_devices
 
-Kind: TypeAlias = tuple[str, str]
-"""Task and family of methods: batches of one kind may share a simulator."""
-
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-
-
-class _Worker:
-    """A process on a GPU, restarted if killed.
-
-    Attributes:
-        kind: Kind of its last batch, which determines its cached simulator.
-    """
-
-    def __init__(self, gpu: str) -> None:
-        self._gpu, self._pool = gpu, _pool(gpu)
-        self.kind: Kind | None = None
-
-    def submit(self, batch: list[Config], note: str) -> Future[list[Outcome]]:
-        """Let it carry out a batch."""
-        self.kind = _kind(batch)
-        return self._pool.submit(_carry_out, batch, f"GPU {self._gpu} {note}")
-
-    def restart(self) -> None:
-        """Replace a process that was killed."""
-        self._pool, self.kind = _pool(self._gpu), None
-
-    def end(self) -> None:
-        """Wait until its files are closed and its kernels cached."""
-        self._pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
@@ -73,60 +45,43 @@ def gpu_workers(
         raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
     # Processes are distributed evenly over GPUs.
     places = names * per_gpu
-    workers = [_Worker(name) for name in places[:most]]
+    pools = [_pool(name) for name in places[:most]]
     try:
-        yield partial(_dispatch, workers, look_up), len(places)
+        yield partial(_dispatch, pools, places, look_up), len(places)
     except BaseException:
         # After Ctrl-C: those that are at work write a checkpoint.
         for process in multiprocessing.active_children():
             process.terminate()
         raise
     finally:
-        for worker in workers:
-            worker.end()
+        for pool in pools:
+            pool.shutdown(cancel_futures=True)
 
 
 def _dispatch(
-    workers: Sequence[_Worker],
+    pools: list[ProcessPoolExecutor],
+    places: Sequence[str],
     look_up: Callable[[Config], Outcome],
     batches: list[list[Config]],
     progress: Callable[[], str],
 ) -> Iterator[Outcome]:
     """Give batches to free processes, and yield the outcomes."""
-    waiting, free = list(batches), list(workers)
-    running: dict[Future[list[Outcome]], tuple[_Worker, list[Config]]] = {}
+    waiting, free = list(batches), list(range(len(pools)))
+    running: dict[Future[list[Outcome]], tuple[int, list[Config]]] = {}
     while waiting or running:
         while waiting and free:
-            worker = free.pop(0)
-            others = [one.kind for one in workers if one is not worker]
-            batch = waiting.pop(choose(waiting, worker.kind, others))
-            running[worker.submit(batch, progress())] = worker, batch
+            number, batch = free.pop(0), waiting.pop(0)
+            note = f"GPU {places[number]} {progress()}"
+            running[pools[number].submit(_carry_out, batch, note)] = number, batch
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            worker, batch = running.pop(future)
-            free.append(worker)
+            number, batch = running.pop(future)
+            free.append(number)
             try:
                 yield from future.result()
             except BrokenProcessPool:
                 # Killed: the result files have its progress.
-                worker.restart()
+                pools[number] = _pool(places[number])
                 yield from map(look_up, batch)
-
-
-def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
-    """Return the number of the next batch for a process: the first of the kind of its simulator, otherwise
-    the first of the kind with the fewest processes.
-
-    Args:
-        waiting: Batches, at least one.
-        own: Kind of the process's last batch, if any.
-        others: Kinds of the other processes' batches.
-    """
-    kinds = [_kind(batch) for batch in waiting]
-    return kinds.index(own if own in kinds else min(kinds, key=others.count))
-
-
-def _kind(batch: Sequence[Config]) -> Kind:
-    return batch[0].task.name, batch[0].method.family
 
 
 # --------------------------------------------------------------------------------------- inside the processes

@@ -113,13 +113,8 @@ def _launcher_settings(launcher: DictConfig) -> Mapping[str, Any]:
 def jobs_of(
     words: Sequence[str], parameters: Mapping[str, Any], config_dir: str | None = None
 ) -> list[list[str]]:
-    """Return the overrides of each run of a sweep.
-
-    Args:
-        words: Prepared overrides; Hydra's settings are ignored.
-        parameters: Values by key of an experiment, restricted by overrides.
-        config_dir: Folder with files of the user's own.
-    """
+    """Return the overrides of each run of a sweep, given prepared overrides, of which Hydra's settings are
+    ignored, and an experiment's values by key, restricted by overrides."""
     parsed = parse([*(f"{key}={value}" for key, value in parameters.items()), *words])
     # The last value of a key counts.
     given = {one.get_key_element(): one for one in parsed if not one.is_hydra_override()}
@@ -129,15 +124,8 @@ def jobs_of(
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
-    """Compose and check the runs of a sweep; shared parts are checked once.
-
-    Args:
-        jobs: Prepared overrides of each.
-        config_dir: Folder with files of the user's own.
-
-    Returns:
-        Configuration of each job, or its error.
-    """
+    """Compose and check the runs of a sweep, given prepared overrides of each; return the configuration of
+    each, or its error. Shared parts are checked once."""
     finished: dict[tuple[str, ...], Config | str] = {}
     entries: list[Config | Outcome] = []
     for job in jobs:
@@ -155,8 +143,7 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
 
 
 def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
-    """Return the configuration for some overrides, or the error in the configuration, the scene or the
-    target."""
+    """Return a configuration, or the error in it, in the scene or the target."""
     try:
         cfg = finish(compose(words, config_dir), words, alone=False)
         check_sources(cfg)
@@ -236,14 +223,8 @@ def run_batches(
 ) -> Iterator[Outcome]:
     """Execute the unfinished runs of a sweep, and yield outcomes.
 
-    Runs in progress in other processes are skipped. If that process ends early, they are resumed here.
-
-    Args:
-        cfgs: Their configurations.
-        carry: Carries out batches.
-        size: Largest number of runs in a batch; default: limited by memory.
-        processes: Number of batches executed concurrently.
-        sharing: Number of these per device.
+    Runs in progress in other processes are skipped. If that process ends early, they are resumed here. Other
+    arguments are those of :func:`plan`.
     """
     # Duplicates count once.
     wanted = {str(cfg.path): cfg for cfg in cfgs}
