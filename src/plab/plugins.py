@@ -76,12 +76,8 @@ def exported_module_path() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes).
-
-    Raises:
-        plab.config.ConfigError: If the text is malformed, the module or name does not exist, the module
-            cannot be imported, or the object is of another kind.
-    """
+    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes); ConfigError
+    if it cannot be imported or is of another kind."""
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
         raise ConfigError(f"'{text}' does not name an object: write module:NAME")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene, drawn_configs
+from plab.config.selection import leaves
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -30,7 +31,7 @@ from plab.objective import (
     total_loss,
 )
 from plab.scenes import SceneError
-from plab.sim import Rollout, Simulator
+from plab.sim import Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, check_target, load_release_target
 
@@ -91,12 +92,8 @@ class BatchMeasures:
 
 
 def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
-    """Build the scene of each configuration, with one object for equal scenes.
-
-    Raises:
-        plab.config.ConfigError: If a variant does not exist.
-        plab.scenes.SceneError: If a scene cannot be simulated.
-    """
+    """Build the scene of each configuration, with one object for equal scenes; errors are those of
+    :func:`plab.config.build_scene`."""
     kinds = kinds_of(cfgs)
     scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
     return [scenes[kind] for kind in kinds]
@@ -126,22 +123,14 @@ def make_simulator(
     Args:
         cfgs: A configuration, or one per environment, with equal ``sim`` and loss.
         scenes: Their scenes, if already built.
-        **options: Arguments of :class:`plab.sim.Simulator` that override the configuration's.
-
-    Raises:
-        plab.config.ConfigError: If a loss term does not exist.
-        plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
-        plab.sim.DeviceError: If CUDA is not available.
+        **options: Arguments of :class:`plab.sim.Simulator`, whose errors apply, that override the
+            configuration's.
     """
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
     sim, method = cfgs[0].sim, cfgs[0].method
-    settings: dict[str, Any] = {
-        "terms": make_terms(method.loss_weights, method.loss_terms),
-        "precision": sim.precision,
-        "device": sim.device,
-        "memory_mb": sim.memory_mb,
-        "deterministic": sim.deterministic,
-    }
+    keys = ("precision", "device", "memory_mb", "deterministic")
+    settings: dict[str, Any] = {key: getattr(sim, key) for key in keys}
+    settings["terms"] = make_terms(method.loss_weights, method.loss_terms)
     return Simulator(build_scenes(cfgs) if scenes is None else scenes, **settings | options)
 
 
@@ -149,13 +138,13 @@ def kinds_of(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal for configurations of the same environment, which differ only in seed,
     files and learning."""
 
-    def text(cfg: Config) -> str:
-        sections = (asdict(part) for part in (cfg.task, cfg.protocol, cfg.sim, cfg.targets))
-        loss = cfg.method.loss_weights, cfg.method.loss_terms
-        return json.dumps([cfg.variant, cfg.seed_particles, *sections, *loss])
-
-    # A planner's batch repeats each configuration.
-    texts = {id(cfg): text(cfg) for cfg in {id(cfg): cfg for cfg in cfgs}.values()}
+    texts: dict[int, str] = {}
+    for cfg in cfgs:
+        # A planner's batch repeats each configuration.
+        if id(cfg) not in texts:
+            sections = (asdict(part) for part in (cfg.task, cfg.protocol, cfg.sim, cfg.targets))
+            loss = cfg.method.loss_weights, cfg.method.loss_terms
+            texts[id(cfg)] = json.dumps([cfg.variant, cfg.seed_particles, *sections, *loss])
     return [texts[id(cfg)] for cfg in cfgs]
 
 
@@ -219,11 +208,9 @@ class Problem:
         if self.target_mass is not self.simulator.target_mass:
             self.target_mass, self._distances = self.simulator.target_mass, None
         kinds = [str(k) for k in range(len(self.scenes))] if kinds is None else kinds
-        pairs = {
-            kind: (mass, target)
-            for kind, mass, target in zip(kinds, self._initial_mass, self.target_mass, strict=True)
-        }
-        judged = {kind: scores(mass, mass, target) for kind, (mass, target) in pairs.items()}
+        pairs = zip(self._initial_mass, self.target_mass, strict=True)
+        first = dict(zip(kinds, pairs, strict=True))
+        judged = {kind: scores(mass, mass, target) for kind, (mass, target) in first.items()}
         self.initial_scores = [judged[kind] for kind in kinds]
         self._rescale()
 
@@ -242,7 +229,6 @@ class Problem:
 
         Raises:
             plab.scenes.SceneError: If a scene cannot be simulated; nothing is changed then.
-            ValueError: If positions have a wrong shape; likewise.
         """
         simulator = self.simulator
         simulator.change_scenes(scenes, particles)
@@ -297,14 +283,9 @@ class Problem:
         return batch_scores(self._scale.like(iou), iou)
 
     def totals(self, terms: Any, loss: Any, first_loss: Any, iou: Any) -> dict[str, float]:
-        """Return the measures of one episode, as in the columns of results; of arrays or tensors.
-
-        Args:
-            terms: Its terms after each step, shape [T, term].
-            loss: Its step losses, shape [T].
-            first_loss: Loss of its initial state.
-            iou: Soft IoUs of the last states, shape [batch]; that of the episode is the first.
-        """
+        """Return the measures of a batch's first episode, as in the columns of results: of its terms after
+        each step, shape [T, term], its step losses, shape [T], the loss of its initial state, and the soft
+        IoUs of the last states, shape [batch]; arrays or tensors."""
         sums = zip(self.term_names, terms.sum(0).tolist(), strict=True)
         return {
             "loss": float(loss.sum()),
@@ -315,17 +296,8 @@ class Problem:
         }
 
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
-        """Simulate actions from the initial states, in the current contact model, and return the measures of
-        the episodes. CUDA tensors stay on the device, except failures.
-
-        Args:
-            actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
-            gradient: Whether to compute the gradient of the trajectory loss.
-
-        Raises:
-            ValueError: If the shape is wrong or an action is not finite.
-            MemoryError: If the gradient does not fit the memory budget.
-        """
+        """Return the measures of the episodes of actions as :meth:`rollout`, without an error for divergence.
+        CUDA tensors stay on the device, except failures."""
         result = self.simulator.rollout(actions, gradient=gradient, strict=False)
         terms, iou = result.step_terms, result.step_iou[:, -1]
         loss = self.loss_of(terms)
@@ -355,15 +327,17 @@ class Problem:
             MemoryError: If the gradient does not fit the memory budget.
         """
         result = self.simulator.rollout(actions, gradient=gradient, strict=strict)
-        final_mass = self.simulator.mass_tensor() if exact else None
+        mass, ious = self.simulator.mass_tensor() if exact else None, result.step_iou[:, -1].tolist()
+        for e in set(range(len(ious))) - set(result.failures) if mass is not None else ():
+            ious[e] = soft_iou(mass[e], self.target_mass[e])
         return Episodes(
             term_names=self.term_names,
             terms=result.step_terms,
             loss=self.loss_of(result.step_terms),
             reward=rewards(result.initial_terms, result.step_terms, self.weights),
             iou=result.step_iou,
-            final_mass=final_mass,
-            scores=self._final_scores(result, final_mass),
+            final_mass=mass,
+            scores=[self._score(e, iou) for e, iou in enumerate(ious)],
             gradient=result.gradient,
             failures=result.failures,
         )
@@ -375,15 +349,6 @@ class Problem:
     def _score(self, e: int, iou: float) -> Scores:
         first = self.initial_scores[e]
         return scores_from_iou(first.iou_initial, iou, first.iou_target_self)
-
-    def _final_scores(self, result: Rollout, final_mass: np.ndarray | None) -> list[Scores]:
-        """Score the last states, from mass tensors if available; scores of diverged environments are
-        meaningless."""
-        ious = [float(iou) for iou in result.step_iou[:, -1]]
-        for e, own in enumerate(() if final_mass is None else final_mass):
-            if e not in result.failures:
-                ious[e] = soft_iou(own, self.target_mass[e])
-        return [self._score(e, iou) for e, iou in enumerate(ious)]
 
 
 def _warn_of_thin(scenes: Sequence[Scene]) -> None:
@@ -408,18 +373,13 @@ def target_distance(mass: np.ndarray) -> np.ndarray:
 
 
 def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool = False) -> np.ndarray:
-    """Build the targets of some configurations, or load them from the release's files.
+    """Return the mass tensors of targets, shape [batch, n, n, n], from the release's files or built as
+    :func:`plab.targets.build_targets` does.
 
     Args:
         cfgs: One configuration per environment, with one object for equal ones.
         simulator: Simulator of their scenes.
         rebuild: Simulate also cached targets.
-
-    Returns:
-        Mass tensors, shape [batch, n, n, n].
-
-    Raises:
-        plab.targets.TargetError: If a target cannot be built or loaded.
     """
     source = cfgs[0].targets.source
     if source is None:
@@ -431,15 +391,14 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 def _require_alike(cfgs: Sequence[Config]) -> None:
     if isinstance(cfgs, Config) or not cfgs:
         raise ConfigError("give a list of configurations, one per environment: [cfg]")
-    for number, cfg in enumerate(cfgs):
-        for part in ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets"):
-            first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
-            if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:
-                raise ConfigError(
-                    f"{differing[0]} differs between sub-environments 0 and {number}: "
-                    f"they share one simulator"
-                )
+    keys = ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets")
+    parts = [dict(leaves({key: _plain(attrgetter(key)(cfg)) for key in keys})) for cfg in cfgs]
+    for number, this in enumerate(parts):
+        if differing := [key for key in parts[0] | this if parts[0].get(key) != this.get(key)]:
+            raise ConfigError(
+                f"{differing[0]} differs between sub-environments 0 and {number}: they share one simulator"
+            )
 
 
-def _entries(section: Any) -> dict[str, Any]:
+def _plain(section: Any) -> dict[str, Any]:
     return section if isinstance(section, dict) else vars(section)

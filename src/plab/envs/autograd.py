@@ -41,11 +41,7 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
         Sum of the weighted step losses of each environment, shape [batch], with the type and device of
         ``actions``.
 
-    Raises:
-        TypeError: If the actions are complex.
-        ValueError: If the shape is wrong or an action is not finite.
-        plab.sim.SimulationError: If state, loss or gradient diverge.
-        MemoryError: If the gradient does not fit the memory budget.
+    Errors are those of :meth:`plab.sim.Simulator.rollout`.
     """
     actions = floating(actions, problem.simulator)
     # Inside an autograd.Function, gradient recording is always disabled.
@@ -125,12 +121,9 @@ def simulate(
 
     Raises:
         TypeError: If ``initial`` has unknown names, or the actions are complex.
-        ValueError: If a shape is wrong or an action is not finite.
         plab.scenes.SceneError: If the material cannot be simulated.
-        plab.sim.SimulationError: If state or gradient diverge.
-        MemoryError: If the gradient does not fit the memory budget.
         RuntimeError: If a gradient is requested after the simulator has been used again, or requires
-            ``full_gradient=True``.
+            ``full_gradient=True``; other errors are those of :meth:`plab.sim.Simulator.record`.
     """
     if unknown := set(initial) - set(_FIELDS):
         raise TypeError(f"'{min(unknown)}' is not a part of a state: {', '.join(_FIELDS)}")
@@ -237,13 +230,8 @@ def policy_gradient(
         value: Function from observations to values, shape [batch]; its parameters receive no gradient.
 
     Returns:
-        Observations, actions and losses, without gradients.
-
-    Raises:
-        ValueError: If an action has another shape or is not finite.
-        gymnasium.error.ResetNeeded: If the episodes have fewer remaining steps.
-        plab.sim.SimulationError: If a state, loss or gradient diverges.
-        MemoryError: If the gradient does not fit the memory budget.
+        Observations, actions and losses, without gradients; errors are those of
+        :meth:`plab.envs.core.EpisodeBatch.closed_loop`.
     """
     own = cast(torch.nn.Module, policy).parameters() if parameters is None else parameters
     parameters = [one for one in own if one.requires_grad]

@@ -69,8 +69,7 @@ def make_batch(task: str, variant: str, **options: Any) -> EpisodeBatch:
         variant: Name of its variant.
         **options: Other arguments of :func:`compose_configs`, and keyword arguments of :class:`EpisodeBatch`.
 
-    Raises:
-        ValueError: If an argument is invalid; see also :class:`EpisodeBatch`.
+    Errors are those of :func:`compose_configs` and :class:`EpisodeBatch`.
     """
     names = ("num_envs", "overrides", "overrides_per_env", "config_dir")
     own = {name: options.pop(name) for name in names if name in options}
@@ -442,9 +441,9 @@ class EpisodeBatch:
         for table, old in zip(self._last, before, strict=True) if rows else ():
             mapped(restore, table, old)
 
-    def require_running(self, idle: np.ndarray | None = None) -> None:
+    def require_running(self, idle: np.ndarray | bool = False) -> None:
         """Raise ResetNeeded if an episode has ended, also by divergence, except ``idle`` ones."""
-        if np.any(self.over if idle is None else self.over & ~idle):
+        if np.any(self.over & ~np.asarray(idle)):
             raise ResetNeeded("the episode is over: call reset() before step()")
 
     @_alone
@@ -595,6 +594,7 @@ class EpisodeBatch:
             Unweighted loss terms after each step, shape [batch, T, term].
 
         Raises:
+            ValueError: If an action has another shape or is not finite.
             gymnasium.error.ResetNeeded: If the episodes have fewer steps left.
             plab.sim.SimulationError: If a state, loss or gradient stops being finite.
             MemoryError: If the gradient does not fit the memory budget.
@@ -616,8 +616,7 @@ class EpisodeBatch:
         return terms
 
     def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
-        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if an episode has fewer
-        remaining steps."""
+        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if fewer remain in one."""
         if self._steps is None:
             raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)

@@ -22,11 +22,7 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
     """
 
     def __init__(self, env: gymnasium.Env[Any, np.ndarray]) -> None:
-        """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``.
-
-        Raises:
-            ValueError: If it does not.
-        """
+        """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``; ValueError if not."""
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):
@@ -35,13 +31,8 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         self.observation_space = goals
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Return minus the fraction of the mass in a wrong cell, for one goal or many.
-
-        Args:
-            achieved_goal: Fractions of the mass in each cell, shape [..., cell, cell, cell].
-            desired_goal: Fractions for the target, same shape.
-            info: Ignored.
-        """
+        """Return minus the fraction of the mass in a wrong cell, for one goal or many: fractions of the mass
+        in each cell, shape [..., cell, cell, cell]. ``info`` is ignored."""
         return -0.5 * np.abs(achieved_goal - desired_goal).sum(axis=(-3, -2, -1))
 
     def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -65,13 +65,8 @@ class EpisodeRandomizer:
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
         """Check that scenes can be simulated over the whole ranges, and build the random scenes.
 
-        Args:
-            cfgs: One configuration per sub-environment, see
-                :func:`~plab.config.randomization.with_own_materials`.
-            problem: Their scenes and targets.
-
-        Raises:
-            plab.config.ConfigError: If a range is invalid.
+        ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; ConfigError if a
+        range is invalid.
         """
         self._problem: Problem | None = problem
         self._cfgs = list(cfgs)
@@ -124,16 +119,13 @@ class EpisodeRandomizer:
         Args:
             environments: Their numbers.
             seeds: Entropy of each sub-environment.
-            given: Values by dotted key that replace samples, for all or one per sub-environment of the batch.
+            given: Values by dotted key that replace samples, for all or one per sub-environment of the batch;
+                ValueError if a key is unknown, or a scene cannot be simulated with a value.
 
         Returns:
             Whether anything differs from the episodes before.
-
-        Raises:
-            ValueError: If a key is unknown, or a scene cannot be simulated with a value.
         """
-        drawn = {e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)}
-        return self.put(drawn)
+        return self.put({e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)})
 
     def put(self, values: Mapping[int, Values]) -> bool:
         """Apply values to some sub-environments; return whether there are any."""
@@ -143,7 +135,7 @@ class EpisodeRandomizer:
         problem = cast(Problem, self._problem)
         scenes, particles, targets = list(problem.scenes), {}, {}
         for e, own in values.items():
-            base = self._base(e, own)
+            base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]
             cfg = with_values(base.cfg, own)
             try:
                 scenes[e] = self._checked(cfg)
@@ -182,11 +174,6 @@ class EpisodeRandomizer:
             )
         return values
 
-    def _base(self, e: int, values: Values) -> _Base:
-        if SCENE in values:
-            return self._pools[id(self._cfgs[e])][values[SCENE]]
-        return self._bases[e]
-
     @staticmethod
     def _checked(cfg: Config) -> Scene:
         """Return the scene of a configuration, whose values may be out of range."""
@@ -194,8 +181,7 @@ class EpisodeRandomizer:
         return build_scene(cfg)
 
     def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
-        """Return the target of a scene: from the recipe if it is not simulated, otherwise from its base
-        scene."""
+        """Return a target that is not simulated of a scene, otherwise that of the base scene."""
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:

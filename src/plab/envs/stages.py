@@ -13,11 +13,7 @@ from plab.problem import Problem, make_targets, target_distance
 
 
 def staged(cfg: Config) -> bool:
-    """Return True if the task has stages before its target.
-
-    Raises:
-        plab.config.ConfigError: If targets are randomised, too.
-    """
+    """Return True if the task has stages before its target; ConfigError if targets are randomised, too."""
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
         raise ConfigError("task.randomize cannot draw scenes or targets of a task with task.stages")
     return bool(cfg.task.stages)
@@ -33,18 +29,15 @@ class Stages:
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Build the targets; ``problem`` has the targets of the last stage.
-
-        Raises:
-            plab.config.ConfigError: If the sub-environments differ in the number of stages.
-            plab.targets.TargetError: If a target cannot be built.
-        """
+        """Build the targets; ``problem`` has those of the last stage. ConfigError if the sub-environments
+        differ in the number of stages."""
         if len({len(cfg.task.stages) for cfg in cfgs}) > 1:
             raise ConfigError("task.stages differ in number between sub-environments")
         self._targets = []
         for number in range(len(cfgs[0].task.stages)):
-            made = {id(cfg): replace(cfg.task, target=cfg.task.stages[number]) for cfg in cfgs}
-            own = {id(cfg): replace(cfg, task=made[id(cfg)]) for cfg in cfgs}
+            # Equal configurations share one object, and so do their targets.
+            targets = {id(cfg): cfg.task.stages[number] for cfg in cfgs}
+            own = {id(c): replace(c, task=replace(c.task, target=targets[id(c)])) for c in cfgs}
             masses = make_targets([own[id(cfg)] for cfg in cfgs], problem.simulator)
             self._targets.append([(mass, target_distance(mass)) for mass in masses])
         self._targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))

@@ -34,15 +34,8 @@ _TRIED = 1 << 15
 
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
-    """Return the mesh of a file, cached by content.
-
-    Args:
-        file: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
-        sha256: Expected SHA-256, likewise.
-
-    Raises:
-        plab.files.ShapeError: If it cannot be read, or does not bound a solid.
-    """
+    """Return the mesh of an OBJ, STL or PLY file, found by :func:`plab.files.pinned` and cached by content;
+    ShapeError if it cannot be read, or does not bound a solid."""
     return _loaded(*pinned(file, sha256))
 
 
@@ -52,18 +45,8 @@ def _loaded(file: str, sha256: str) -> Mesh:
 
 
 def read_mesh(file: str, **options: Any) -> Any:
-    """Read an OBJ, STL or PLY file with trimesh.
-
-    Args:
-        file: The file.
-        **options: Further arguments of ``trimesh.load``.
-
-    Returns:
-        A ``trimesh.Trimesh``, or another of trimesh's objects with vertices.
-
-    Raises:
-        plab.files.ShapeError: If it cannot be read, or trimesh is not installed.
-    """
+    """Read an OBJ, STL or PLY file with ``trimesh.load`` as one of trimesh's objects with vertices;
+    ShapeError if it cannot be read, or trimesh is not installed."""
     try:
         # Imported here, because it takes a second and is rarely needed.
         import trimesh
@@ -153,15 +136,8 @@ class Mesh:
         return winding != 0
 
     def fill(self, count: int, draw: Callable[[tuple[int, int]], np.ndarray]) -> np.ndarray:
-        """Draw points uniformly inside.
-
-        Args:
-            count: Number of points.
-            draw: Function that returns uniform random numbers in [0, 1) of a given shape.
-
-        Returns:
-            Positions, shape [count, 3].
-        """
+        """Draw points uniformly inside, shape [count, 3]; ``draw`` returns uniform random numbers in [0, 1)
+        of a given shape."""
         found, parts = 0, []
         while found < count:
             points = (draw((_BLOCK, 3)) - 0.5) * self.extent

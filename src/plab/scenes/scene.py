@@ -235,15 +235,8 @@ def make_body(
 ) -> Body:
     """Create a body from a configuration, reading the mesh file if any.
 
-    Args:
-        shape: ``sphere``, ``box`` or ``mesh``.
-        center: Centre (x, y, z) [domain units].
-        size: Sphere: radius. Box: edge lengths x, y, z. Mesh: longest edge of its bounding box [domain
-            units].
-        particles: Number of particles.
-        file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
-        sha256: SHA-256 of the file, likewise.
-        **material: Its own law and parameters, as fields of the body.
+    Arguments are fields of the :class:`Body` or :class:`MeshBody`, and for a mesh its OBJ, STL or PLY file
+    and SHA-256, see :func:`plab.files.pinned`.
 
     Raises:
         SceneError: If a mesh has no file, or another shape has one.
@@ -319,18 +312,6 @@ def _capsule_support(size: Sequence[float], d: np.ndarray) -> float:
     return 0.5 * size[0] * abs(d[1]) + size[1]
 
 
-def _torus_support(size: Sequence[float], d: np.ndarray) -> float:
-    return size[0] * np.hypot(d[0], d[2]) + size[1]
-
-
-def _cylinder_support(size: Sequence[float], d: np.ndarray) -> float:
-    return size[0] * np.hypot(d[0], d[2]) + size[1] * abs(d[1])
-
-
-def _box_support(size: Sequence[float], d: np.ndarray) -> float:
-    return float(np.abs(d) @ np.asarray(size))
-
-
 MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
     "Sphere": ManipulatorShape(("radius",), "translate", _XYZ, support=lambda size, _d: size[0]),
     "Capsule": ManipulatorShape(("h", "r"), "translate", _XYZ, support=_capsule_support),
@@ -338,10 +319,20 @@ MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
         ("h", "r"), "roll", ("roll", "yaw", "vertical"), "Capsule", _capsule_support
     ),
     "Chopsticks": ManipulatorShape(("h", "r"), "grip", (*_XYZ, *_ROTATION, "close")),
-    "Torus": ManipulatorShape(("tx", "ty"), "translate", _XYZ, support=_torus_support),
-    "Cylinder": ManipulatorShape(("radius", "half_height"), "static", (), support=_cylinder_support),
+    "Torus": ManipulatorShape(
+        ("tx", "ty"), "translate", _XYZ, support=lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1]
+    ),
+    "Cylinder": ManipulatorShape(
+        ("radius", "half_height"),
+        "static",
+        (),
+        support=lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1] * abs(d[1]),
+    ),
     "Box": ManipulatorShape(
-        ("half_x", "half_y", "half_z"), "rigid", (*_XYZ, *_ROTATION), support=_box_support
+        ("half_x", "half_y", "half_z"),
+        "rigid",
+        (*_XYZ, *_ROTATION),
+        support=lambda size, d: float(np.abs(d) @ np.asarray(size)),
     ),
 }
 """The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
@@ -470,10 +461,7 @@ class Scene:
     @property
     def particle_volume(self) -> float:
         """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab
-        release.
-
-        It cancels in the motion and only scales the mass tensor and therefore the loss.
-        """
+        release. It cancels in the motion and only scales the mass tensor and therefore the loss."""
         return (0.5 * self.dx) ** 2
 
     @property
@@ -543,8 +531,7 @@ class Scene:
         return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
 
     def facts(self) -> dict[str, Any]:
-        """Return the scene as plain data, except meshes, without values that bodies inherit from the
-        scene."""
+        """Return the scene as plain data, except meshes, without values that bodies inherit from it."""
         facts = asdict(self)
         if self.kinematics is None:
             del facts["kinematics"]
@@ -667,14 +654,9 @@ def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
 
 
 def sample_particles(scene: Scene) -> np.ndarray:
-    """Sample the initial particle positions, uniformly inside each body.
-
-    Args:
-        scene: The scene; They depend only on ``particle_seed``, ``sampling_convention`` and the bodies.
-
-    Returns:
-        Positions [domain units], shape [particle, 3], float64, body after body.
-    """
+    """Sample the initial particle positions [domain units], uniformly inside each body; shape [particle, 3],
+    float64, body after body. They depend only on ``particle_seed``, ``sampling_convention`` and the
+    bodies."""
     # With seed 0 bitwise identical to the release's.
     release = scene.sampling_convention == "release"
     rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)
