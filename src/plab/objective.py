@@ -15,9 +15,6 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError, ConfigError, pick
 
-OBSERVED_PARTICLES = 200
-"""Least number of particles in an observation: every (particle count // this)-th is observed."""
-
 TARGET_ENTRIES = 14
 """Length of :func:`target_observation`."""
 

@@ -31,7 +31,7 @@ from plab.config.run import Config
 from plab.config.suite import conf_folder
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
-from plab.scenes import Scene, vector3
+from plab.scenes import MATERIAL_KEYS, Scene, vector3
 from plab.targets import check_target, load_release_target
 
 GROUPS = ("task", "method", "protocol", "sim")
@@ -73,15 +73,7 @@ OmegaConf.register_new_resolver("by_task", _by_task, replace=True)
 
 
 def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the names of a group's files.
-
-    Args:
-        group: ``task``, ``method``, ``protocol``, ``sim`` or ``experiment``.
-        config_dir: Folder with the user's files, in subfolders named like the groups.
-
-    Returns:
-        Name to file, sorted by name.
-    """
+    """Return the files of a group, such as ``task``, by name, sorted: plab's own and the user's."""
     folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir)])]
     files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
     return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
@@ -114,17 +106,11 @@ _KEPT: dict[tuple[Any, ...], bytes] = {}
 
 
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
-    """Return Hydra's composition of prepared overrides, without its own section.
+    """Return Hydra's composition of prepared overrides, without its own section; ConfigError if an override
+    or a file does not fit.
 
     Hydra takes a tenth of a second. Configurations that differ only in values are composed once, and the
     values are set afterwards, as Hydra does.
-
-    Args:
-        words: Prepared overrides.
-        config_dir: Folder with the user's files.
-
-    Raises:
-        ConfigError: If an override or a file does not fit.
     """
     parsed = parse(words)
     values = [one for one in parsed if _sets_a_value(one)]
@@ -178,15 +164,8 @@ def _sets_a_value(override: Override) -> bool:
 
 
 def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
-    """Reject selections of files that Hydra would misinterpret, before composition.
-
-    Args:
-        words: Prepared overrides.
-        config_dir: Folder with the user's files and modules, see :mod:`plab.plugins`.
-
-    Raises:
-        ConfigError: If a group is not given exactly one choice, or the folder cannot be used.
-    """
+    """Raise ConfigError for selections of files that Hydra would misinterpret, and for a folder of the user's
+    files and modules, see :mod:`plab.plugins`, that cannot be used."""
     if config_dir is not None:
         folder = Path(config_dir).expanduser()
         if not str(config_dir).strip() or not folder.is_dir():
@@ -209,22 +188,10 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
 
 
 def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = True) -> Config:
-    """Convert a composed configuration to a checked one.
+    """Convert the result of :func:`compose` to a checked configuration, see :func:`load_config`.
 
     The chosen variant is merged over the task. The result contains only the chosen variant, because unused
     values are not part of a run's configuration.
-
-    Args:
-        composed: The composed configuration, without Hydra's own section.
-        words: Prepared overrides; overrides without effect are errors.
-        alone: Whether there is no other run, on which an override about another variant, task or profile
-            could have its effect.
-
-    Returns:
-        The checked configuration.
-
-    Raises:
-        ConfigError: If a value is missing, of the wrong type or out of range.
     """
     try:
         composed.method = _typed_method(composed.method, "method")
@@ -237,7 +204,10 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
         for section in (composed.method, composed.method.get("planner", {})):
             if "lr_by_task" in section:
                 _resolve(section, TABLES)
-        _choose_numbers(composed, overrides)
+        if composed.protocol.numbers == "release":
+            _refuse_undone(overrides, composed.task.release, "protocol.numbers=release", "task.release")
+            composed.task.merge_with(composed.task.release)
+        composed.task.release = {}
         _choose_variant(composed, overrides)
         parts = vars(OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
@@ -252,15 +222,8 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
-    """Return copies of a configuration with random scenes (``variant=random``).
-
-    Args:
-        cfg: The configuration.
-        seeds: A ``seed_scene`` for each.
-
-    Raises:
-        ConfigError: If the task is not an unmodified task of the suite, or has no section ``random``.
-    """
+    """Return copies of a configuration with random scenes (``variant=random``), one per ``seed_scene``;
+    ConfigError if the task is not an unmodified task of the suite, or has no section ``random``."""
     from plab.config.randomization import with_own_materials
 
     name, own = cfg.task.name, [f"variant={cfg.variant}"]
@@ -285,13 +248,7 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
 
 
 def build_scene(cfg: Config) -> Scene:
-    """Build the scene of a configuration.
-
-    Args:
-        cfg: A configuration.
-
-    Returns:
-        The validated scene.
+    """Build and validate the scene of a configuration.
 
     Raises:
         ConfigError: If the task is that of another variant.
@@ -302,18 +259,11 @@ def build_scene(cfg: Config) -> Scene:
         advice = pick(cfg.variant, list(task.variants))
         raise ConfigError(f"variant {cfg.variant} of task {task.name} does not exist; {advice}")
     scene = Scene(
-        name=task.name,
         bodies=task.build_bodies(sim.particles_scale),
         **task.build_tools(),
-        youngs_modulus=task.youngs_modulus,
-        poisson_ratio=task.poisson_ratio,
-        yield_stress=task.yield_stress,
-        floor_friction=task.floor_friction,
+        **{key: getattr(task, key) for key in ("name", *MATERIAL_KEYS, "floor_friction")},
+        **{key: getattr(sim, key) for key in ("grid_size", "dt", "substeps", "horizon")},
         gravity=vector3(task.gravity),
-        grid_size=sim.grid_size,
-        dt=sim.dt,
-        substeps=sim.substeps,
-        horizon=sim.horizon,
         particle_seed=cfg.seed_particles,
         sampling_convention=protocol.start,
         digits_convention=protocol.numbers,
@@ -352,8 +302,7 @@ def require_runnable(cfg: Config) -> None:
 
 
 def _typed_method(method: DictConfig, path: str) -> DictConfig:
-    """Return a typed section ``method``; ConfigError if there is no such family, an OmegaConfBaseException if
-    a key or a value does not fit."""
+    """Return a typed section ``method``."""
     if not isinstance(method, DictConfig) or "family" not in method:
         raise ConfigError(f"{path}.family has no value: name the family, or its module:NAME")
     if isinstance(stages := method.get("stages"), DictConfig):
@@ -430,14 +379,6 @@ def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
         section[table] = {}
 
 
-def _choose_numbers(composed: DictConfig, overrides: Sequence[Override]) -> None:
-    """Apply the release's numbers to the task if requested, and remove the section."""
-    if composed.protocol.numbers == "release":
-        _refuse_undone(overrides, composed.task.release, "protocol.numbers=release", "task.release")
-        composed.task.merge_with(composed.task.release)
-    composed.task.release = {}
-
-
 def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None:
     """Merge the variant, sampled if random, into the task, and remove the others."""
     task, name = composed.task, composed.variant
@@ -461,14 +402,11 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
 
 def _reject_unknown(node: Any, path: str) -> None:
     """Reject keys that no dataclass defines; Hydra lets ``+key=value`` add them."""
-    if not isinstance(node, DictConfig):
+    if not isinstance(node, DictConfig) or node._is_missing() or node._is_none() or node._is_interpolation():
         return
     kind = OmegaConf.get_type(node)
     known = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else None
     for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
         if known is not None and key not in known:
             raise ConfigError(f"unknown key '{path}{key}'; {pick(key, known)}")
-        if isinstance(below, DictConfig) and not (
-            below._is_missing() or below._is_none() or below._is_interpolation()
-        ):
-            _reject_unknown(below, f"{path}{key}.")
+        _reject_unknown(below, f"{path}{key}.")

@@ -11,11 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    OmegaConfBaseException,
-)
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
 from plab.config.suite import EXTENSION_TASKS
@@ -72,15 +68,8 @@ def _parsed(word: str) -> Override:
 
 
 def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
-    """Return the values that an override gives, as texts.
-
-    Args:
-        override: An override, such as ``seed=0,1`` or ``task=glob(R*)``.
-        names: Choices of a glob.
-
-    Raises:
-        ConfigError: If it gives none.
-    """
+    """Return the values that an override gives, as texts, such as ``seed=0,1`` or ``task=glob(R*)`` out of
+    ``names``; ConfigError if it gives none."""
     value = override.value()
     if isinstance(value, IntervalSweep):
         raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")

@@ -47,11 +47,8 @@ Values = dict[str, Any]
 
 
 def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the lowest and highest values of sampled parameters, by dotted key, sorted.
-
-    Raises:
-        ConfigError: If a range is invalid, or its key cannot be randomised.
-    """
+    """Return the lowest and highest values of sampled parameters, by dotted key, sorted; ConfigError if a
+    range is invalid, or its key cannot be randomised."""
     found: dict[str, tuple[Any, Any]] = {}
 
     def collect(node: Any, key: str) -> None:
@@ -79,12 +76,8 @@ def _range(task: TaskConfig, bounds: Any, key: str) -> tuple[Any, Any]:
 
 
 def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
-    """Return the value of a randomised key as a number or a list of numbers.
-
-    Raises:
-        ConfigError: If the key cannot be randomised, or the value is invalid; the message begins with
-            ``path``.
-    """
+    """Return the value of a randomised key as a number or a list of numbers; ConfigError, beginning with
+    ``path``, if the key cannot be randomised, or the value is invalid."""
     present = present_value(task, key, path)
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "iuf" or numbers.shape != np.shape(present):
@@ -108,10 +101,10 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
             return 0.0
     node: Any = task
     for name in key.split("."):
-        names = list(node) if isinstance(node, Mapping) else list(getattr(node, "__dict__", ()))
-        if name not in names:
-            raise ConfigError(f"{path}: task.{key} does not exist; {pick(name, names)}")
-        node = node[name] if isinstance(node, Mapping) else getattr(node, name)
+        entries = _entries(node)
+        if name not in entries:
+            raise ConfigError(f"{path}: task.{key} does not exist; {pick(name, list(entries))}")
+        node = entries[name]
     if node is None and rest[-1:] and rest[-1] in MATERIAL_KEYS:
         return 0.0
     fixed = group == "bodies" and rest[-1] in _FIXED
@@ -119,6 +112,11 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
         advice = "; use offset" if rest[-1:] == ["center"] else ""
         raise ConfigError(f"{path}: task.{key} cannot be drawn{advice}")
     return node
+
+
+def _entries(node: Any) -> dict[str, Any]:
+    """Return the values of a part of a task by key, which can be set."""
+    return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 
 def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Values:
@@ -131,21 +129,18 @@ def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Val
 
 
 def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
-    """Return a configuration with some values replaced in the task; ``yaw`` and ``observation_noise`` are not
-    included."""
+    """Return a configuration with some values replaced in the task, except ``yaw`` and noise."""
     task = copy.deepcopy(cfg.task)
     for key, value in values.items():
         *parts, last = key.split(".")
-        node: Any = task
+        entries = _entries(task)
         for name in parts:
-            node = node[name] if isinstance(node, Mapping) else getattr(node, name)
+            entries = _entries(entries[name])
         if last == "offset":
             last = _POSITIONS[parts[0]]
-            value = [a + b for a, b in zip(getattr(node, last), value, strict=True)]
-        if isinstance(node, dict):
-            node[last] = value
-        elif hasattr(node, last):
-            setattr(node, last, value)
+            value = [a + b for a, b in zip(entries[last], value, strict=True)]
+        if last in entries:
+            entries[last] = value
     return replace(cfg, task=task)
 
 
@@ -199,12 +194,8 @@ _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
-    """Sample the changes of a random variant, in the structure of the entries of ``variants``.
-
-    Raises:
-        ConfigError: If the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid.
-        OmegaConfBaseException: If the task lacks a value or has one of the wrong type.
-    """
+    """Sample the changes of a random variant, in the structure of the entries of ``variants``; ConfigError if
+    the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid."""
     if not task.random:
         raise ConfigError(
             f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"

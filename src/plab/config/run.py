@@ -196,15 +196,10 @@ class Config:
         self.sim.check("sim")
 
     def method_as(self, kind: type[Method]) -> Method:
-        """Return the section ``method``, checked to be of a runner's type.
-
-        Raises:
-            TypeError: If it has another type.
-        """
+        """Return the section ``method``; TypeError unless it is of a runner's type."""
         if not isinstance(self.method, kind):
-            raise TypeError(
-                f"method {self.method.name} has a {type(self.method).__name__}, not a {kind.__name__}"
-            )
+            name, own = self.method.name, type(self.method).__name__
+            raise TypeError(f"method {name} has a {own}, not a {kind.__name__}")
         return self.method
 
 

@@ -35,16 +35,8 @@ class Selection:
 
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
-    """Parse selections of a command line, ``name=value``, with several values as in a sweep.
-
-    Args:
-        words: Such as ``seed=0,1,2`` or ``seed=range(3)``.
-        names: Names for selecting runs; dotted names are keys of the configuration.
-
-    Raises:
-        ArgumentError: If a name is unknown, or a selection does more than compare a value.
-        ConfigError: If a selection cannot be parsed, or has no value.
-    """
+    """Parse selections of a command line, such as ``seed=0,1`` or ``seed=range(3)``, by ``names`` and dotted
+    keys of the configuration; ArgumentError or ConfigError if one is invalid."""
     if not words:
         return Selection()
     # Imported here, because Hydra is slow to import and not needed without overrides.
