@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -189,6 +190,7 @@ def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> Non
 def test_arguments_are_checked(sim: Simulator) -> None:
     out = sim.state()
     out.x[1, 2] = 0.95
+    make = partial(Simulator, device=DEVICE)
     for call, named in (
         (lambda: sim.step(np.zeros((3, 5))), "actions"),
         (lambda: sim.step(np.full((3, 6), math.nan)), "NaN"),
@@ -197,12 +199,12 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         (lambda: sim.set_material(poisson_ratio=0.7), "poisson_ratio"),
         (lambda: replace(ball(), dt=0.1).validate(), "substeps >= "),
         (lambda: ball(center=(0.5, 0.95, 0.5)).validate(), "outside the domain"),
-        (lambda: Simulator([ball()], particles=[np.full((7, 3), 0.5)]), "particles are 7, .* has 300"),
+        (lambda: make([ball()], particles=[np.full((7, 3), 0.5)]), "particles are 7, .* has 300"),
         (lambda: sim.set_state(out), "environment 1, particle 2 is at .*, outside -0.03125 .. 0.9062"),
         (lambda: sim.set_initial_state(replace(out, x=out.x * math.nan)), r"particle 0 is at \(nan"),
-        (lambda: Simulator([ball(), replace(ball(), manipulators=())]), "manipulators"),
+        (lambda: make([ball(), replace(ball(), manipulators=())]), "manipulators"),
         (lambda: Simulator(SCENES, device="gpu"), "device 'gpu' is not one of cpu, cuda"),
-        (lambda: Simulator(SCENES, precision="f64"), "precision 'f64' is not one of float32, float64"),
+        (lambda: make(SCENES, precision="f64"), "precision 'f64' is not one of float32, float64"),
     ):
         with pytest.raises(ValueError, match=named):
             call()
