@@ -22,12 +22,13 @@ from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
 from plab.render.rollouts import record
-from plab.render.shapes import body_mesh, manipulator_parts, pose_matrix, target_mesh
 from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.sim.cameras import CameraSensor
 from suite import KINDS, SCALES, SIZES
 from toy_runner import COARSE
+
+shapes = pytest.importorskip("plab.render.shapes")
 
 SIZE = (160, 120)
 CUBE = Body("box", (0.4, 0.1, 0.5), (0.2, 0.2, 0.2), 800)
@@ -81,8 +82,8 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
         points = torch.from_numpy(points)
         return reference_mpm.signed_distance(manipulator, torch.from_numpy(pose), points)[0].numpy()
 
-    for part in manipulator_parts(manipulator):
-        mesh = part.mesh.transform(pose_matrix(pose, part.side), inplace=False)
+    for part in shapes.manipulator_parts(manipulator):
+        mesh = part.mesh.transform(shapes.pose_matrix(pose, part.side), inplace=False)
         assert np.abs(distance(mesh.points.astype(float))).max() < 1e-6
         faces = mesh.compute_normals(point_normals=False, auto_orient_normals=False)
         # Chords of arcs are a little inside; outwards is outside.
@@ -97,7 +98,7 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
 @pytest.mark.parametrize("body", [CUBE, BALL], ids=["box", "sphere"])
 def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(body):
     x = sample_particles(scene(bodies=(body,)))
-    mesh = body_mesh(body, x)
+    mesh = shapes.body_mesh(body, x)
     assert mesh.is_manifold
     assert mesh.volume == pytest.approx(body.volume, rel=0.1)
     assert mesh.center_of_mass() == pytest.approx(x.mean(axis=0), abs=0.004)
@@ -105,11 +106,11 @@ def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(
     assert np.abs(mesh.points - body.center).max(axis=0) == pytest.approx(body.half_extent(), abs=0.022)
 
     turned = x @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]) + [0.1, 0.2, 0.3]
-    moved = body_mesh(body, turned)
+    moved = shapes.body_mesh(body, turned)
     assert moved.volume == pytest.approx(mesh.volume, rel=0.02)
     assert moved.center_of_mass() == pytest.approx(turned.mean(axis=0), abs=0.01)
 
-    target = target_mesh(scene(), box_mass(np.array([0.5, 0.4, 0.5])))
+    target = shapes.target_mesh(scene(), box_mass(np.array([0.5, 0.4, 0.5])))
     assert target.volume == pytest.approx(0.2**3, rel=0.15)
     assert target.center_of_mass() == pytest.approx([0.5, 0.4, 0.5], abs=0.01)
 

@@ -26,11 +26,11 @@ from plab.demonstrations import known_actions
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.rollouts import RecordedRollout
-from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.scenes import sample_particles
 from plab.view import Viewer, show
 from toy_runner import COARSE
 
+shapes = pytest.importorskip("plab.render.shapes")
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
 
@@ -85,11 +85,13 @@ def test_the_page_holds_particles_and_manipulators_of_every_frame(recording, pag
     assert list(shown) == [0, 1, 2, 3]
     for step, x in shown.items():
         assert x.reshape(-1, 3) == pytest.approx(recording.x[step], abs=0.51 / 2**16)
-    parts = [(k, part) for k, m in enumerate(recording.scene.manipulators) for part in manipulator_parts(m)]
+    parts = [
+        (k, part) for k, m in enumerate(recording.scene.manipulators) for part in shapes.manipulator_parts(m)
+    ]
     assert len(parts) == 3
     for thing, (number, part) in zip(things(page)["manipulators"], parts, strict=True):
         for step, matrix in frames(thing["model_matrix"]).items():
-            expected = pose_matrix(recording.poses[step, number], part.side)
+            expected = shapes.pose_matrix(recording.poses[step, number], part.side)
             assert matrix.reshape(4, 4) == pytest.approx(expected, abs=1e-6)
 
 
