@@ -25,7 +25,6 @@ from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
 from plab.runners.planner import (
     Asking,
-    CandidateStart,
     Planner,
     PlannerConfig,
     PlannerRunner,
@@ -33,7 +32,6 @@ from plab.runners.planner import (
     Stages,
     StagesConfig,
 )
-from plab.runners.policy import packed, unpacked
 
 if TYPE_CHECKING:
     from cmaes import CMA
@@ -81,29 +79,26 @@ class Multistart(Planner):
 
     method: MultistartConfig
 
-    def __init__(self, method: MultistartConfig, start: CandidateStart) -> None:
-        super().__init__(method, start)
-        zeros = torch.zeros((method.population, *start.shape), dtype=torch.float64, device=start.device)
-        self._places = [place.clone().requires_grad_() for place in zeros]
-        by_rate = [(lr, self._places[k :: len(method.lrs)]) for k, lr in enumerate(method.lrs)]
-        groups = [{"params": places, "lr": lr} for lr, places in by_rate if places]
-        first, second = method.betas
-        self._adam = torch.optim.Adam(groups, betas=(first, second), eps=method.eps)
-
     def begin(self, random: torch.Generator, found: Tensor) -> None:
         count = self.method.population
         kept = found[: count - round(self.method.fresh * count)]
-        self._put(torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]), range(count))
+        places = torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]).clamp(-1.0, 1.0)
+        moments = {name: torch.zeros_like(places) for name in ("mean", "square")}
+        self.memory |= {"actions": places, "updates": places.new_zeros(count), **moments}
 
     def iterate(self, random: torch.Generator) -> Asking:
         """Evaluate the candidates in the hard model, update all, and replace the worse half at intervals."""
-        method, softness = self.method, self._softness()
-        actions = self._actions()
+        method, actions, softness = self.method, self.memory["actions"], None
+        if method.contact == "soft":
+            # Changes geometrically over the iterations.
+            end, last = method.softness_end or method.softness, max(method.iterations - 1, 1)
+            softness = method.softness * (end / method.softness) ** (self.iteration / last)
         answer = shown = yield Request(actions, gradient=softness is None)
         order = shown.cost(method.objective).argsort(stable=True)
         for update in range(method.updates):
             if update > 0 or softness is not None:
-                answer = yield Request(self._actions(), softness, gradient=True)
+                answer = yield Request(self.memory["actions"], softness, gradient=True)
+            assert answer.gradient is not None
             self._descend(answer.gradient)
         self.memory["order"] = order
         if (self.iteration + 1) % method.replace_every == 0 and self.iteration + 1 < method.iterations:
@@ -111,33 +106,22 @@ class Multistart(Planner):
         return self.show(actions, shown)
 
     def candidates(self) -> Tensor:
-        return self._actions()[self.memory["order"]]
+        return self.memory["actions"][self.memory["order"]]
 
-    def _softness(self) -> float | None:
-        """Decay rate of the soft contact in this iteration; None in the hard model."""
-        method = self.method
-        if method.contact == "hard":
-            return None
-        end = method.softness if method.softness_end is None else method.softness_end
-        return method.softness * (end / method.softness) ** (self.iteration / max(method.iterations - 1, 1))
-
-    def _actions(self) -> Tensor:
-        return torch.stack([place.detach() for place in self._places])
-
-    def _put(self, actions: Tensor, numbers: Any) -> None:
-        """Place candidates, shape [N, T, A], with zero moments."""
-        for place, own in zip(numbers, actions, strict=True):
-            self._places[place].data.copy_(own.clamp(-1.0, 1.0))
-            self._adam.state.pop(self._places[place], None)
-
-    def _descend(self, gradient: Tensor | None) -> None:
-        """Make a step of Adam with gradients of shape [P, T, A]."""
-        assert gradient is not None
-        for place, own in zip(self._places, gradient, strict=True):
-            place.grad = own
-        self._adam.step()
-        for place in self._places:
-            place.data.clamp_(-1.0, 1.0)
+    def _descend(self, gradient: Tensor) -> None:
+        """Make a step of Adam, as ``torch.optim.Adam``, with gradients of shape [P, T, A]."""
+        memory, (first, second), lrs = self.memory, self.method.betas, self.method.lrs
+        memory["updates"] = memory["updates"] + 1
+        mean = memory["mean"] = torch.lerp(memory["mean"], gradient, 1 - first)
+        square = (second * memory["square"]).addcmul(gradient, gradient, value=1 - second)
+        memory["square"] = square
+        rates, roots = [], []
+        for k, step in enumerate(memory["updates"].tolist()):
+            rates.append(lrs[k % len(lrs)] / (1 - first**step))
+            roots.append((1 - second**step) ** 0.5)
+        rate, root = mean.new_tensor([rates, roots])[..., None, None]
+        moved = memory["actions"] - rate * mean / (square.sqrt() / root + self.method.eps)
+        memory["actions"] = moved.clamp(-1.0, 1.0)
 
     def _replace(self, order: Tensor, random: torch.Generator) -> None:
         """Replace the worse half of the candidates, some by new starts, some by neighbours of better ones."""
@@ -147,22 +131,10 @@ class Multistart(Planner):
         unit = torch.rand(
             (beside, *self.start.shape), generator=random, dtype=torch.float64, device=order.device
         )
-        moved = self._actions()[better[:beside]] + (2.0 * unit - 1.0) * self.method.action_init
-        self._put(torch.cat([moved, fresh]), worse.tolist())
-
-    def state(self) -> dict[str, Any]:
-        moments = {k: self._adam.state[p] for k, p in enumerate(self._places) if p in self._adam.state}
-        kept = packed({"actions": self._actions(), "moments": moments})
-        return super().state() | {"torch": kept}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        kept = unpacked(state["torch"])
-        self._put(kept["actions"], range(len(self._places)))
-        for k, own in kept["moments"].items():
-            # Adam's step count stays on the CPU.
-            on = {name: v if name == "step" else v.to(self._places[k].device) for name, v in own.items()}
-            self._adam.state[self._places[k]] = on
+        moved = self.memory["actions"][better[:beside]] + (2.0 * unit - 1.0) * self.method.action_init
+        self.memory["actions"][worse] = torch.cat([moved, fresh]).clamp(-1.0, 1.0)
+        for name in ("mean", "square", "updates"):
+            self.memory[name][worse] = 0.0
 
 
 @dataclass
