@@ -110,15 +110,13 @@ def test_no_better_score_is_given_up() -> None:
     rng, finalists, shown = np.random.default_rng(0), trajectory.Finalists(), []
     for iteration in range(30):
         soft, loss = rng.random(2)
-        finalists.add(np.full((2, 1), soft), iteration, {"loss": loss, "score": soft})
+        finalists.add(trajectory.Finalist(np.full((2, 1), soft), iteration, loss, soft))
         if iteration % trajectory.CHECK_INTERVAL == trajectory.CHECK_INTERVAL - 1:
             for one in (finalists.highest, finalists.lowest):
                 one.hard_score = float(rng.random())
                 shown.append(one.hard_score)
             finalists.keep_best()
-            again = trajectory.Finalists()
-            again.restore(finalists.state())
-            finalists = again
+            finalists = trajectory.Finalists.of(finalists.state())
         assert not shown or finalists.kept_score == max(shown)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,14 +11,9 @@ from plab.objective import TARGET_MASS
 from plab.scenes import Camera, Scene, sample_particles
 
 
-@dataclass(frozen=True)
-class View:
-    """The viewing direction for a task.
-
-    Attributes:
-        azimuth: Angle around the y axis [degrees]; 0 looks along -z, 90 along -x.
-        elevation: Angle above the floor [degrees].
-    """
+class View(NamedTuple):
+    """Viewing direction: angle around the y axis [degrees], where 0 looks along -z and 90 along -x, and angle
+    above the floor [degrees]."""
 
     azimuth: float
     elevation: float

@@ -177,8 +177,7 @@ def save_policy(
     Raises:
         ResultsError: If the file cannot be written.
     """
-    header = json.dumps({"format": _FORMAT, "method": asdict(method)})
-    arrays: dict[str, Any] = {"header": np.array(header)}
+    arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
         space = cast("Box", getattr(policy, f"{name}_space"))
         arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
@@ -205,15 +204,13 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
     try:
         policy = _policy(path)
     except FileNotFoundError:
-        raise ResultsError(
-            f"{path} is not there: sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
-        ) from None
+        why = "sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
+        raise ResultsError(f"{path} is not there: {why}") from None
     except ResultsError:
         raise
     except Exception as error:
-        raise ResultsError(
-            f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
-        ) from error
+        why = f"is no policy of plab's ({one_line(error)}): run it again with force=true"
+        raise ResultsError(f"{path} {why}") from error
     # Errors of the device do not concern the file.
     policy.network = policy.network.to(device)
     return policy
@@ -232,11 +229,9 @@ def _policy(path: Path) -> Policy:
     own = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in own}
     # Checked before networks of that size are created.
-    observed, actions = spaces.sizes
-    widths = [observed, *getattr(method, "hidden", ()), actions]
-    needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
-    there = sum(values.numel() for values in parameters.values())
-    if needed > there:
+    widths = [spaces.sizes[0], *method.hidden, spaces.sizes[1]]
+    needed = sum(map(math.prod, itertools.pairwise(widths)))
+    if needed > (there := sum(values.numel() for values in parameters.values())):
         raise ValueError(f"it has {there} parameters, its networks at least {needed}")
     network = first_policy(method, spaces)
     network.load_state_dict(parameters)
@@ -251,12 +246,11 @@ def _method(section: Any, path: Path) -> PolicyConfig:
         raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} before")
     try:
         kind = family(name).config_type(section["algorithm"])
-        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section))
-        cast(PolicyConfig, method).check("method")
+        method = cast(PolicyConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section)))
+        method.check("method")
     except ConfigError as error:
         raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
-        raise ValueError(
-            f"its section method is invalid: {(error.msg or str(error)).splitlines()[0]}"
-        ) from error
-    return cast(PolicyConfig, method)
+        why = (error.msg or str(error)).splitlines()[0]
+        raise ValueError(f"its section method is invalid: {why}") from error
+    return method

@@ -236,7 +236,6 @@ class PolicyRunner(Runner):
 
     training: type[Any] | None = None
     policies: Training
-    _pace = 0.0
     _shown = ""
 
     def _kind(self) -> type[Any]:
@@ -299,10 +298,8 @@ class PolicyRunner(Runner):
         evaluations = evaluate(self._judge, training.decide)
         learned, states = training.take(), training.states()
         share = (time.perf_counter() - start) / len(tracks)
-        steps = training.steps - before
-        self._pace = steps / share
         every, differentiated = training.round_episodes
-        simulated = steps if training.simulates else 0
+        simulated = training.steps - before if training.simulates else 0
         gradient = simulated // every * differentiated
         for track, done, own, state in zip(tracks, evaluations, learned, states, strict=True):
             start = time.perf_counter()
@@ -335,12 +332,11 @@ class PolicyRunner(Runner):
         return self.policies.episodes, total, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report reward and score on average, and the transitions of all policies per second."""
+        """Report reward and score on average."""
         reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
         mean = "" if len(rows) == 1 else "mean "
         self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
-        pace = f"{self._pace:.0f} steps/s " if self._pace else ""
-        self.report(self.policies.episodes, pace + self._shown)
+        self.report(self.policies.episodes, self._shown)
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
@@ -362,12 +358,10 @@ def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
         return f"all {learned.ended} training episodes diverged, the first in {broken[0]}"
     if done.failure and track.best_actions is None:
         return done.failure
-    provenance = track.run.result.provenance
     for name, texts in (("episodes", broken), ("evaluations", [done.failure] if done.failure else [])):
         if texts:
-            provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
-            _log.warning(
-                "%s: iteration %d: %d %s diverged and were frozen until their end, the first in %s",
-                *(track.run.path, track.iteration, len(texts), name, texts[0]),
-            )
+            counts, key = track.run.result.provenance, f"broken_{name}"
+            counts[key] = counts.get(key, 0) + len(texts)
+            where = track.run.path, track.iteration, len(texts), name, texts[0]
+            _log.warning("%s: iteration %d: %d %s diverged and were frozen, the first in %s", *where)
     return ""

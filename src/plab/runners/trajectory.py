@@ -86,11 +86,11 @@ class TrajectoryRunner(Runner):
         method = track.cfg.method_as(TrajectoryConfig)
         kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
         rule = self._rules[track.number] = kind(method, (scene.horizon, scene.action_dim), track.cfg.seed)
-        finalists = self._finalists[track.number] = Finalists()
+        self._finalists[track.number] = Finalists()
         if state is not None:
             rule.actions = np.array(state["actions"])
             rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
-            finalists.restore(state.get("finalists", {}))
+            self._finalists[track.number] = Finalists.of(state["finalists"])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Run the actions of all, and improve those of each by their gradient."""
@@ -107,17 +107,21 @@ class TrajectoryRunner(Runner):
                 continue
             gradient = cast(np.ndarray, episodes.gradient)[number]
             self._rules[number].step(gradient)
-            rows[track] = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
-            self._finalists[number].add(tried[number], track.iteration, rows[track])
+            rows[track] = row = measures(episodes, number)
+            row["gradient_norm"] = float(np.linalg.norm(gradient))
+            new = Finalist(tried[number].copy(), track.iteration, row["loss"], row["score"])
+            self._finalists[number].add(new)
         # As the release has it, the last iteration counts, whatever is kept.
         judging = [track for track in rows if track.cfg.protocol.score != "last"]
-        checks = self._check([track for track in judging if self._is_due(track)])
+        ahead = {track: self.iterations(track) - track.iteration - 1 for track in judging}
+        due = [t for t in judging if ahead[t] == 0 or (t.iteration + 1) % CHECK_INTERVAL == 0]
+        checks = self._check(due, [track for track in due if ahead[track] == 0])
         share = (time.perf_counter() - start) / len(tracks)
         for track, row in rows.items():
             rule, finalists = self._rules[track.number], self._finalists[track.number]
             kept = finalists.keep_best() if track in checks else None
-            if track in checks and self.iterations(track) == track.iteration + 1:
-                track.run.result.provenance["lowest_loss_score"] = finalists.lowest.hard_score
+            if ahead.get(track) == 0:
+                track.run.result.provenance["lowest_loss_score"] = cast(Finalist, finalists.lowest).hard_score
             step = Step(
                 row | {"kept_score": finalists.kept_score},
                 tried[track.number],
@@ -131,30 +135,25 @@ class TrajectoryRunner(Runner):
             )
             yield track, step
 
-    def _is_due(self, track: Track) -> bool:
-        return (track.iteration + 1) % CHECK_INTERVAL == 0 or track.iteration + 1 == self.iterations(track)
-
-    def _check(self, tracks: Sequence[Track]) -> dict[Track, int]:
-        """Score finalists of some runs in the hard contact model; return the rollouts of each run."""
-        rounds: list[dict[int, Finalist]] = [{}, {}]
-        for track in tracks:
-            finalists, last = self._finalists[track.number], track.iteration + 1 == self.iterations(track)
-            chosen = [finalists.highest, *([finalists.lowest] if last else [])]
-            for one, own in zip(chosen, rounds, strict=False):
-                if track.cfg.method.contact == "hard":
-                    one.hard_score = one.score
-                else:
-                    own[track.number] = one
-        for own in filter(None, rounds):
+    def _check(self, tracks: Sequence[Track], ending: Sequence[Track]) -> dict[Track, int]:
+        """Score in the hard contact model the actions of highest score of some runs, and those of lowest loss
+        of ending ones; return the rollouts of each run."""
+        rollouts = dict.fromkeys(tracks, 0)
+        for name, some in (("highest", tracks), ("lowest", ending)):
+            chosen: dict[Track, Finalist] = {t: getattr(self._finalists[t.number], name) for t in some}
             tried = self.actions_at_rest()
-            for number, one in own.items():
-                tried[number] = one.actions
-            self.problem.simulator.set_contact("hard")
-            judged = self.problem.rollout(tried, gradient=False, strict=False, exact=False)
-            self._set_contact()
-            for number, one in own.items():
-                one.hard_score = -1.0 if number in judged.failures else judged.scores[number].score
-        return {track: sum(track.number in own for own in rounds) for track in tracks}
+            for track, one in chosen.items():
+                tried[track.number], one.hard_score = one.actions, one.score
+            soft = {track: one for track, one in chosen.items() if track.cfg.method.contact == "soft"}
+            if soft:
+                self.problem.simulator.set_contact("hard")
+                judged = self.problem.rollout(tried, gradient=False, strict=False, exact=False)
+                self._set_contact()
+            for track, one in soft.items():
+                failed = track.number in judged.failures
+                one.hard_score = -1.0 if failed else judged.scores[track.number].score
+                rollouts[track] += 1
+        return rollouts
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Report the loss, and the score of the actions that are kept; see :class:`Finalists`."""
@@ -180,6 +179,7 @@ class Finalist:
     hard_score: float = np.nan
 
 
+@dataclass
 class Finalists:
     """Actions of a run that may be kept.
 
@@ -191,41 +191,40 @@ class Finalists:
         highest: Actions of the highest score since the last check, if there were any.
         lowest: Actions of the lowest loss.
         kept_score: Score of the actions that are kept, in the hard contact model; NaN before the first check.
+        kept_loss: Their loss.
     """
 
-    highest: Finalist
-    lowest: Finalist
-    kept_score = _kept_loss = float("nan")
+    highest: Finalist | None = None
+    lowest: Finalist | None = None
+    kept_score: float = np.nan
+    kept_loss: float = np.nan
 
-    def add(self, actions: np.ndarray, iteration: int, row: Mapping[str, float]) -> None:
+    def add(self, new: Finalist) -> None:
         """Consider the actions of an iteration."""
-        new = Finalist(actions.copy(), iteration, row["loss"], row["score"])
-        highest, lowest = getattr(self, "highest", new), getattr(self, "lowest", new)
-        self.highest = min(highest, new, key=lambda one: (-one.score, one.loss))
-        self.lowest = min(lowest, new, key=lambda one: one.loss)
+        self.highest = min(self.highest or new, new, key=lambda one: (-one.score, one.loss))
+        self.lowest = min(self.lowest or new, new, key=lambda one: one.loss)
 
     def keep_best(self) -> Finalist | None:
         """Return the checked finalist if it is better than the kept actions, and reset the highest score."""
         best = None
-        for one in (self.highest, self.lowest):
+        for one in filter(None, (self.highest, self.lowest)):
             better = not one.hard_score <= self.kept_score or (
-                one.hard_score == self.kept_score and one.loss < self._kept_loss
+                one.hard_score == self.kept_score and one.loss < self.kept_loss
             )
             if one.hard_score >= 0.0 and better:
-                best, self.kept_score, self._kept_loss = one, one.hard_score, one.loss
-        del self.highest
+                best, self.kept_score, self.kept_loss = one, one.hard_score, one.loss
+        self.highest = None
         return best
 
     def state(self) -> dict[str, Any]:
         """Return everything as arrays and numbers."""
-        named = {name: vars(one) for name, one in vars(self).items() if isinstance(one, Finalist)}
-        return named | {"kept_score": self.kept_score, "kept_loss": self._kept_loss}
+        return {n: vars(v) if isinstance(v, Finalist) else v for n, v in vars(self).items() if v is not None}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
-        for name in {"highest", "lowest"} & state.keys():
-            setattr(self, name, Finalist(**state[name]))
-        self.kept_score, self._kept_loss = (float(state.get(f"kept_{n}", np.nan)) for n in ("score", "loss"))
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> Finalists:
+        """Restore from a :meth:`state`."""
+        own: dict[str, Any] = {n: Finalist(**v) if isinstance(v, Mapping) else v for n, v in state.items()}
+        return cls(**own)
 
 
 class UpdateRule:
