@@ -130,10 +130,9 @@ def test_files_that_are_damaged_or_lead_elsewhere(path: Path) -> None:
     for content in (whole[:-30], b"", b"not a zip file at all", whole[:200] + bytes(200) + whole[400:]):
         path.write_bytes(content)
         assert str(path) in why(read, path)
-    for name, named in (("../out", "'../out'"), ("secret", "no manifest.json")):
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr(name, b"/etc/passwd")
-        assert named in why(read, path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("../out", b"/etc/passwd")
+    assert "no manifest.json" in why(read, path)
     path.unlink()
     assert str(path) in why(read, path)
 
@@ -190,7 +189,6 @@ def test_actions_that_are_refused(path: Path, content: bytes, fault: str) -> Non
         (1, {"steps": True}, "steps"),
         (1, {"file": "actions/9.npy"}, "actions/9.npy"),
         (1, {"file": "card.yaml"}, "card.yaml"),
-        (1, {"targets": "authors", "variant": UNSEEN[0]}, UNSEEN[0]),
         (1, {"variant": "1", "steps": 100}, "Move-v1 after 100 steps"),
     ],
 )
@@ -227,23 +225,17 @@ def test_cards_that_are_read() -> None:
 def test_configurations_have_their_names_and_compose_themselves() -> None:
     names = {
         "Rope-v3": ["task=Rope", "variant=3"],
-        "Move-v1-release": ["task=Move", "protocol=release"],
         f"Move-v{UNSEEN[2]}": ["task=Move", "variant=random", f"seed_scene={UNSEEN[2][6:]}"],
     }
     for name, words in names.items():
         cfg = load_config(words)
         configuration = configuration_of(cfg)
         assert configuration.name == name
-        assert checksum(configuration.config(())) == checksum(cfg)
-    words = ["task=Torus", "variant=2", "protocol=release", "targets.source=there"]
-    authors = configuration_of(load_config(words))
-    assert authors.name == "Torus-v2-authors-release"
-    assert authors.config(("targets.source=there",)).targets.source == "there"
-    assert "targets.source" in why(authors.config, ())
-
+        assert checksum(configuration.config()) == checksum(cfg)
     drawn = load_config(["task=Move", "variant=random", "seed_scene=3"])
     assert "Move-vrandom3" in why(configuration_of, drawn)
-    assert "protocol" in why(configuration_of, load_config(["task=Move", "protocol.floor=release"]))
+    for word in ("protocol.floor=release", "targets.source=there"):
+        assert "protocol=plab" in why(configuration_of, load_config(["task=Move", word]))
 
 
 # ------------------------------------------------------------------------------------------ command lines
@@ -293,7 +285,7 @@ def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Ca
 
 
 def real(variant: str, steps: int, score: float, **which: Any) -> Entry:
-    own = checksum(Configuration("Move", variant).config(()))
+    own = checksum(Configuration("Move", variant).config())
     return entry(variant, steps, score, checksum=own, **which)
 
 
@@ -400,5 +392,5 @@ def test_the_page_shows_it_and_takes_no_text_for_html(folder: Path, tmp_path: Pa
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "&lt;b&gt;bold&lt;/b&gt;" in text and "<b>bold" not in text
     assert '<a href="https://example.org/mine" rel="nofollow noopener">plans</a>' in text
-    assert "do not hold; why" in text and text.count("<section>") == 5
+    assert "do not hold; why" in text and text.count("<section>") == 3
     assert not re.findall(r'(?:src|href)="(?!https?://)', text)

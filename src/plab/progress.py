@@ -14,11 +14,9 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column
 
 Report = Callable[[int, str], None]
 """Function of the number of finished steps and a short status text."""
@@ -29,6 +27,9 @@ such as :func:`plab.sim.compiler.watch_compiling`."""
 
 PLAIN_EVERY = 10
 """Default number of steps between lines without a terminal."""
+
+
+_TEXTS = ("description", "fields[text]")
 
 
 @contextmanager
@@ -56,9 +57,9 @@ def show_progress(
     """
     watch, console = compiling or (lambda note: nullcontext()), Console()
     if enabled and console.is_terminal and multiprocessing.parent_process() is None:
-        with Progress(
-            *_columns(total), console=console, expand=total is not None, transient=not total
-        ) as bars:
+        bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()
+        title_column, text = (TextColumn(f"{{task.{part}}}", markup=False) for part in _TEXTS)
+        with Progress(title_column, *bar, text, console=console, transient=not total) as bars:
             task = bars.add_task(title, total=total, completed=start, text="")
 
             def note(kernel: str) -> None:
@@ -79,36 +80,20 @@ def show_line(text: str) -> None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
 
-def _columns(total: int | None) -> tuple[ProgressColumn, ...]:
-    """Return the parts of the bar; on narrow terminals the bar is dropped first, then the text."""
-    title, text = (
-        TextColumn(f"{{task.{part}}}", markup=False, table_column=Column(no_wrap=True))
-        for part in ("description", "fields[text]")
-    )
-    if total is None:
-        return title, text
-    return (
-        title,
-        BarColumn(bar_width=None, table_column=Column(ratio=1)),
-        MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        text,
-    )
-
-
 def _plain(title: str, start: int, total: int, every: int) -> Report:
-    first: tuple[float, int] | None = None
+    begin: tuple[float, int] | None = None
     last = start
 
     def report(done: int, text: str) -> None:
-        nonlocal first, last
+        nonlocal begin, last
         now = time.monotonic()
-        if first is None or done == first[1]:
+        left = "started"
+        if begin is None or done == begin[1]:
             # The first step includes compilation and is excluded from the speed.
-            first, left = first or (now, done), "started"
+            begin = begin or (now, done)
         else:
-            begin, before = first
-            left = f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
+            seconds = (now - begin[0]) / (done - begin[1]) * (total - done)
+            left = f"{timedelta(seconds=round(seconds))} left"
         # A step may be a batch of episodes and skip multiples of the interval.
         if last == start or done // every > last // every or done == total:
             print(f"{title} {done}/{total}, {left}, {text}", flush=True)

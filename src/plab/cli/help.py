@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
-from collections.abc import Iterator
-from pathlib import Path
 
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
 
@@ -41,20 +38,23 @@ FLAGS
   --cfg job         print the configuration and stop; with --package sim, only that section
   --config-dir DIR  use the YAML files in DIR/task, DIR/method, DIR/sim and DIR/experiment, too
   -h, --help        this text
-  --help-all        more examples, what each choice is, and every key with its default
+  --help-all        more examples, and the files of all choices with every key and its default
 """
 
-_COMMON_KEYS = {
-    "config.yaml": ("variant", "seed", "results_dir", "force", "progress", "logger"),
-    "method/adam.yaml": ("method.iterations", "method.lr"),
-    "sim/fast.yaml": ("sim.device", "sim.particles_scale"),
-}
-"""Keys explained in the short text, by file."""
+_KEYS = """\
+KEYS used often, with their defaults
+  variant=1                 of the task; random is drawn by seed_scene
+  seed=0                    random numbers of the method
+  method.iterations=200     updates of the actions
+  method.lr=0.1             step size
+  sim.device=cpu            cpu or cuda
+  sim.particles_scale=1.0   share of the particles, for quick tries
+  results_dir=results       folder of the result files
+  force=false               begin again, and replace what is there
+  logger=none               tensorboard or wandb, too
+"""
 
-_WIDTH, _SHORT, _LONG = 100, 24, 52
-"""Column widths of the short text, and of keys and defaults in both texts."""
-
-_KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P<comment>.*))?$")
+_WIDTH = 100
 
 
 def help_text(config_dir: str | None = None) -> str:
@@ -65,44 +65,19 @@ def help_text(config_dir: str | None = None) -> str:
         start = f"  {'+' if group == EXPERIMENT else ''}{group}="
         names = ", ".join(choices(group, config_dir))
         parts += textwrap.wrap(names, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
-    parts += ["", "KEYS used often, with their defaults"]
-    for name, keys in _COMMON_KEYS.items():
-        for key, line in _keys(conf_folder() / name, _SHORT):
-            if key in keys:
-                parts += textwrap.wrap(line, _WIDTH, subsequent_indent=" " * (_SHORT + 3))
-    return "\n".join(parts)
+    return "\n".join([*parts, "", _KEYS.rstrip()])
 
 
 def full_help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help-all``: ``--help``, more examples, a description of each choice, and every
-    key with default and explanation."""
-    parts = [_USAGE, _MORE_EXAMPLES, _FLAGS]
-    keys = ["KEYS, with their defaults:", *(line for _, line in _keys(conf_folder() / "config.yaml", _LONG))]
+    """Return the text of ``--help-all``: ``--help``, more examples, and the commented YAML file of each
+    choice, which has every key with its default."""
+    head = "FILES, whose keys are below the name of the group, such as method.lr"
+    parts = [help_text(config_dir), _MORE_EXAMPLES, head]
+    files = {"config": conf_folder() / "config.yaml"}
     for group in (*GROUPS, EXPERIMENT):
         sign = "+" if group == EXPERIMENT else ""
-        parts.append("SIMULATOR PRESETS" if group == "sim" else f"{group.upper()}S")
-        for name, path in choices(group, config_dir).items():
-            # The first line of an experiment is Hydra's package directive.
-            lines = path.read_text(encoding="utf-8").removeprefix("# @package _global_\n").splitlines()
-            parts.append(f"  {sign}{group}={name:<10} {lines[0].lstrip('# ')}")
-            if group == "method" or name in ("plab", "fast", "Rope"):
-                keys += [f"  of {group}={name}:", *(line for _, line in _keys(path, _LONG))]
-        parts.append("")
-    return "\n".join([*parts, *keys])
-
-
-def _keys(path: Path, width: int) -> Iterator[tuple[str, str]]:
-    """Yield each commented key of a YAML file, except Hydra's, and its line: default and explanation."""
-    prefix = f"{path.parent.name}." if path.parent.name in GROUPS else ""
-    parents: list[str] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        match = _KEY.match(line)
-        if match is None:
-            continue
-        depth = len(match["indent"]) // 2
-        parents[depth:] = [match["key"]]
-        if parents[0] in ("defaults", "hydra") or (len(parents) > 1 and parents[0] == "variants"):
-            continue
-        key = prefix + ".".join(parents)
-        value = re.sub(r"^[&*]\w+|.*\$\{.*", "", match["value"].strip())
-        yield key, f"  {f'{key}={value}' if value else key:<{width}} {match['comment'] or ''}".rstrip()
+        files |= {f"{sign}{group}={name}": path for name, path in choices(group, config_dir).items()}
+    for title, path in files.items():
+        text = path.read_text(encoding="utf-8").removeprefix("# @package _global_\n").rstrip()
+        parts.append(f"\n{title}\n{textwrap.indent(text, '  ')}")
+    return "\n".join(parts)

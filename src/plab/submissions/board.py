@@ -38,35 +38,15 @@ OWN = Card("", ("plab contributors",), "", budget=0, hardware="NVIDIA H200", gra
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 """Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
 
-TableKey: TypeAlias = tuple[str, str]
-"""Set of configurations (``suite``, ``unseen`` or ``authors``) and protocol (``plab`` or ``release``)."""
-
 Point: TypeAlias = tuple[str, str, int, float, float]
 """Task, variant, environment steps, score in float32 and in float64 (NaN if unknown)."""
 
 
-_PLAYED = "The score is that of one episode in the hard contact model, of the plan or policy handed in."
-_ORIGIN = {
-    "plab": "Start, numbers and floor are plab's (protocol=plab)",
-    "release": "Start, numbers and floor are those of the authors' code (protocol=release)",
+_TABLES = {
+    "suite": ("plab's suite", "the targets of plab's own recipes", SUITE_VARIANTS),
+    "unseen": ("Unseen configurations", f"drawn by seed_scene, {UNSEEN[0]} to {UNSEEN[-1]}", UNSEEN),
 }
-_TARGETS = {
-    "suite": ("plab's suite", "the targets of plab's own recipes", len(SUITE_VARIANTS)),
-    "unseen": (
-        "Unseen configurations",
-        f"drawn starts and targets ({UNSEEN[0]} to {UNSEEN[-1]}) of each task",
-        len(UNSEEN),
-    ),
-    "authors": ("The authors' suite", "the authors' target files", len(SUITE_VARIANTS)),
-}
-"""Heading, origin of the targets, and variants of a task, by set of configurations."""
-
-_TABLES: dict[TableKey, str] = {
-    **{(kind, "plab"): "" for kind in _TARGETS},
-    ("authors", "release"): " on its terms",
-    **{(kind, "release"): " on the authors' terms" for kind in ("suite", "unseen")},
-}
-"""Ends of headings, in the order of the page; the first four tables are shown without lines, too."""
+"""Heading, description and variants of a set of configurations."""
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, Any]], list[str]]:
@@ -87,33 +67,36 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, A
     """
     if not folder.is_dir():
         raise SubmissionError(f"there is no folder {folder}")
-    tables: dict[TableKey, list[dict[str, Any]]] = defaultdict(list)
+    lines: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _TABLES}
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
-            for table, line in _submission_lines(path, tuple(overrides)):
-                tables[table].append(line)
+            for kind, line in _submission_lines(path, tuple(overrides)):
+                lines[kind].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    tables["suite", "plab"] += _own_runs("example", "suite")
-    tables["authors", "plab"] += _own_runs("targets", "authors")
-    tables["authors", "release"] += _own_runs("release", "authors")
-    sections = []
-    for number, ((kind, terms), ending) in enumerate(_TABLES.items()):
-        title, targets, _ = _TARGETS[kind]
-        if tables[kind, terms] or number < 4:
-            protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
-            sections.append(_table(f"{title}{ending}", protocol, kind, tables[kind, terms]))
+    for card, runs in _runs("example").items():
+        points = [_point(row, steps_to_best(row), "score_best") for row in runs]
+        lines["suite"].append(_line(card, "plans", "own runs", SUITE_VARIANTS, points))
+    played = "Score of one episode in the hard contact model, of the plan or policy handed in; protocol=plab"
+    sections = [
+        _table(title, f"{played}, {what}.", variants, lines[kind])
+        for kind, (title, what, variants) in _TABLES.items()
+    ]
     return [*sections, _paper()], left_out
 
 
-def _table(title: str, protocol: str, kind: str, lines: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def _table(
+    title: str, protocol: str, variants: Sequence[str], lines: Iterable[dict[str, Any]]
+) -> dict[str, Any]:
     best_first = sorted(lines, key=lambda line: (-line["score"], line["card"].name))
-    expected = len(suite_tasks()) * _TARGETS[kind][-1]
+    expected = len(suite_tasks()) * len(variants)
     return {"title": title, "protocol": protocol, "expected": expected, "lines": best_first}
 
 
-def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> dict[str, Any]:
+def _line(
+    card: Card, track: str, status: str, variants: Sequence[str], points: Iterable[Point]
+) -> dict[str, Any]:
     """Return a line of a table.
 
     Returns:
@@ -124,7 +107,7 @@ def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point
         by task, None without scores.
     """
     table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
-    each = _TARGETS[kind][-1]
+    each = len(variants)
     expected = len(suite_tasks()) * each
 
     def best(rows: pd.DataFrame) -> pd.DataFrame:
@@ -150,11 +133,10 @@ def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point
 
 @functools.cache
 def _known_checksum(one: Configuration, overrides: tuple[str, ...]) -> str:
-    # The scene does not depend on the target, so the authors' files are not needed.
-    return checksum(replace(one, targets="suite").config(overrides), one.targets)
+    return checksum(one.config(overrides))
 
 
-def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, dict[str, Any]]]:
+def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the lines of a submission with their tables.
 
     Raises:
@@ -175,14 +157,14 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
         if wrong := [v for v in verification.verdicts if v.outcome in (LIES, BROKE_OFF)]:
             raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
         status = "verified" if verification.outcomes == {HOLDS} else "claimed"
-    tables: dict[TableKey, list[Point]] = defaultdict(list)
+    tables: dict[str, list[Point]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
         scores = {} if verification is None else verification.verdicts[number].scores
         own, score = entry.configuration, scores.get("float32", entry.score)
         point = own.task, own.variant, entry.steps, score, scores.get("float64", math.nan)
-        tables["unseen" if own.variant in UNSEEN else own.targets, own.terms].append(point)
-    for table, points in tables.items():
-        yield table, _line(submission.card, submission.track, status, table[0], points)
+        tables["unseen" if own.variant in UNSEEN else "suite"].append(point)
+    for kind, points in tables.items():
+        yield kind, _line(submission.card, submission.track, status, _TABLES[kind][-1], points)
 
 
 # -------------------------------------------------------------------------------------------- first entries
@@ -197,12 +179,6 @@ def _runs(archive: str) -> dict[Card, list[Row]]:
         if row.values["seed"] == 0 and look.kind == GRADIENT:
             groups[replace(OWN, name=look.label)].append(row)
     return groups
-
-
-def _own_runs(archive: str, kind: str) -> Iterator[dict[str, Any]]:
-    for card, runs in _runs(archive).items():
-        points = [_point(row, steps_to_best(row), "score_best") for row in runs]
-        yield _line(card, "plans", "own runs", kind, points)
 
 
 def _point(row: Row, steps: int, score: str) -> Point:
@@ -220,14 +196,14 @@ def _paper() -> dict[str, Any]:
             steps=_PAPER_STEPS[gradient], score=own["iou_mean"], exact=math.nan
         )
         track = "plans" if gradient else "policies"
-        lines.append(_line(card, track, "printed", "authors", points.itertuples(index=False, name=None)))
+        lines.append(_line(card, track, "printed", SUITE_VARIANTS, points.itertuples(index=False, name=None)))
     for card, runs in _runs("release").items():
         own = [_point(row, _PAPER_STEPS[True], "score") for row in runs]
-        lines.append(_line(card, "plans", "own runs", "authors", own))
+        lines.append(_line(card, "plans", "own runs", SUITE_VARIANTS, own))
     protocol = (
-        f"{_ORIGIN['release']}; the authors' target files. The score is that of the last iteration as it was "
+        "protocol=release, the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
         f"{PAPER_SEED_COUNT} seeds in the paper, of one seed of plab's runs. Nothing handed in is judged "
         "like this, so that these numbers compare with those of no other table."
     )
-    return _table("The paper's table", protocol, "authors", lines)
+    return _table("The paper's table", protocol, SUITE_VARIANTS, lines)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from plab.config import Config, load_config
+from plab.config import Config
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
 from plab.render import RenderError, rollouts
@@ -32,7 +32,6 @@ from plab.submissions.submission import (
     configuration_of,
     encode,
     read,
-    variant_words,
     write,
 )
 from plab.submissions.verifying import load_policy, play
@@ -62,7 +61,7 @@ class _BestEpisodes:
         """
         self.steps = 0
         self._configuration = configuration_of(cfg)
-        self._checksum = checksum(cfg, self._configuration.targets)
+        self._checksum = checksum(cfg)
         self._best: dict[float, Entry] = {}
         self._path = path
         try:
@@ -188,9 +187,8 @@ def _of_run(row: Row) -> Entry:
         cfg, actions = rollouts.stored(row.path)
     except RenderError as error:
         raise SubmissionError(str(error)) from None
-    configuration, steps = configuration_of(cfg), steps_to_best(row)
-    same = checksum(cfg, configuration.targets)
-    return Entry(configuration, same, steps, row.values["score_best"], actions)
+    score = row.values["score_best"]
+    return Entry(configuration_of(cfg), checksum(cfg), steps_to_best(row), score, actions)
 
 
 def steps_to_best(row: Row) -> int:
@@ -224,12 +222,11 @@ def from_policies(
             files[name] = path.read_bytes()
         except OSError as error:
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
-        cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
+        cfgs = [Configuration(task, variant).config(overrides) for variant in variants]
         played = play(cfgs, load_policy(name, files[name]), "float32", str(path))
         for cfg, (score, failure) in zip(cfgs, played, strict=True):
             configuration = configuration_of(cfg)
             if failure:
                 raise SubmissionError(f"{configuration.name}: the simulation diverged, {failure}")
-            same = checksum(cfg, configuration.targets)
-            entries.append(Entry(configuration, same, steps, score, policy=name))
+            entries.append(Entry(configuration, checksum(cfg), steps, score, policy=name))
     return entries, files

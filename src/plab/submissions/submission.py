@@ -10,7 +10,7 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
@@ -33,12 +33,6 @@ SUFFIX = ".plabsub.zip"
 
 FORMAT = 2
 """Version of the layout; files of another one are not read."""
-
-TERMS = ("plab", "release")
-"""Protocols of submissions, which determine initial particles, numbers and floor of a scene."""
-
-TARGETS = ("suite", "authors")
-"""Sources of targets: the suite's recipes, or the files of the original release."""
 
 UNSEEN = tuple(f"random{seed}" for seed in range(9000, 9010))
 """Variants of every task reserved for evaluation: ``variant=random`` with these ``seed_scene``."""
@@ -80,50 +74,27 @@ class Card:
 
 @dataclass(frozen=True, order=True)
 class Configuration:
-    """Task, variant, targets and protocol of an entry.
+    """Task and variant of an entry, of plab's protocol and targets.
 
     Attributes:
         task: Name of the task.
         variant: One of :data:`VARIANTS`.
-        targets: One of :data:`TARGETS`.
-        terms: One of :data:`TERMS`.
     """
 
     task: str
     variant: str
-    targets: str = "suite"
-    terms: str = "plab"
 
     @property
     def name(self) -> str:
-        """Short name, such as ``Move-v1`` or ``Move-v1-authors-release``."""
-        more = [part for part in (self.targets, self.terms) if part not in (TARGETS[0], TERMS[0])]
-        return "-".join([self.task, f"v{self.variant}", *more])
+        """Short name, such as ``Move-v1``."""
+        return f"{self.task}-v{self.variant}"
 
-    def config(self, overrides: tuple[str, ...]) -> Config:
-        """Compose its configuration, with overrides such as ``sim.device=cuda``; with the authors' targets,
-        ``targets.source``.
-
-        Raises:
-            plab.config.ConfigError: If an override is invalid.
-            SubmissionError: If the authors' targets are needed, and not given.
-        """
-        # The folder of the authors' files applies only to their targets.
-        mine = tuple(word for word in overrides if not word.startswith("targets.source="))
-        if self.targets == "authors":
-            if mine == overrides:
-                raise SubmissionError(
-                    f"{self.name} needs the authors' target files: add targets.source=<their folder>"
-                )
-            mine = overrides
-        return load_config([*variant_words(self.task, self.variant), f"protocol={self.terms}", *mine])
-
-
-def variant_words(task: str, variant: str) -> list[str]:
-    """Return the overrides for one of :data:`VARIANTS` of a task."""
-    if variant in UNSEEN:
-        return [f"task={task}", "variant=random", f"seed_scene={variant.removeprefix('random')}"]
-    return [f"task={task}", f"variant={variant}"]
+    def config(self, overrides: Sequence[str] = ()) -> Config:
+        """Compose its configuration, with overrides such as ``sim.device=cuda``."""
+        variant = [f"variant={self.variant}"]
+        if self.variant in UNSEEN:
+            variant = ["variant=random", f"seed_scene={self.variant.removeprefix('random')}"]
+        return load_config([f"task={self.task}", *variant, *overrides])
 
 
 def configuration_of(cfg: Config) -> Configuration:
@@ -132,26 +103,20 @@ def configuration_of(cfg: Config) -> Configuration:
     Raises:
         SubmissionError: If the leaderboard has no such configuration.
     """
-    choices = {cfg.protocol.start, cfg.protocol.numbers, cfg.protocol.floor}
-    if len(choices) > 1:
-        raise SubmissionError(
-            "start, numbers and floor of the protocol are mixed: submit for protocol=plab or protocol=release"
-        )
-    if cfg.variant not in VARIANTS:
+    own = {cfg.protocol.start, cfg.protocol.numbers, cfg.protocol.floor} == {"plab"}
+    if not own or cfg.targets.source is not None or cfg.variant not in VARIANTS:
         seeds = f"seed_scene={UNSEEN[0].removeprefix('random')} to {UNSEEN[-1].removeprefix('random')}"
         raise SubmissionError(
-            f"{cfg.task.name}-v{cfg.variant} is no configuration of the leaderboard: those are the variants "
-            f"1 to 5, and variant=random with {seeds}"
+            f"{cfg.task.name}-v{cfg.variant} is no configuration of the leaderboard: those have "
+            f"protocol=plab, plab's own targets, and the variants 1 to 5, or variant=random with {seeds}"
         )
-    targets = TARGETS[cfg.targets.source is not None]
-    return Configuration(cfg.task.name, cfg.variant, targets, choices.pop())
+    return Configuration(cfg.task.name, cfg.variant)
 
 
-def checksum(cfg: Config, targets: str = TARGETS[0]) -> str:
+def checksum(cfg: Config) -> str:
     """Return the SHA-256, in hex, of what determines a score beside the actions: bodies, manipulators,
-    material, discretisation and horizon, and the recipe of the target unless it is one of the authors'."""
-    target = cfg.task.target if targets == TARGETS[0] else targets
-    facts = {"scene": build_scene(cfg).facts(), "target": target}
+    material, discretisation, horizon, and recipe of the target."""
+    facts = {"scene": build_scene(cfg).facts(), "target": cfg.task.target}
     text = json.dumps(facts, sort_keys=True, default=attrgetter("sha256"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -326,10 +291,8 @@ def inconsistency(submission: Submission) -> str | None:
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
     """Return an entry of the manifest with its actions; ValueError, KeyError or TypeError for mistakes."""
-    configuration = Configuration(*(record[key] for key in ("task", "variant", "targets", "terms")))
-    variants = SUITE_VARIANTS if configuration.targets == "authors" else VARIANTS
-    known = configuration.task in suite_tasks() and configuration.variant in variants
-    known = known and configuration.targets in TARGETS and configuration.terms in TERMS
+    configuration = Configuration(record["task"], record["variant"])
+    known = configuration.task in suite_tasks() and configuration.variant in VARIANTS
     _require(known, f"{where}: the leaderboard has no {configuration}")
     steps, score, file = record["steps"], record["score"], record["file"]
     _require(type(steps) is int and 0 <= steps < 10**15, f"{where}: steps is {steps!r:.60}")

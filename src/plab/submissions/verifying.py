@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -104,15 +104,14 @@ def verify(
     cfgs = _configs(submission, given)
     played: dict[int, dict[str, tuple[float, str]]] = defaultdict(dict)
     # Each group fits into one simulator.
-    alike: dict[Any, list[int]] = defaultdict(list)
+    alike: dict[tuple[str, str], list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
-        configuration = entry.configuration
         if run_policies or not entry.policy:
-            alike[configuration.task, configuration.targets, configuration.terms, entry.policy].append(number)
-    policies = {name: load_policy(name, submission.policies[name]) for *_, name in alike if name}
+            alike[entry.configuration.task, entry.policy].append(number)
+    policies = {name: load_policy(name, submission.policies[name]) for _, name in alike if name}
     # Changing the precision restarts Taichi.
     for precision in precisions:
-        for (*_, name), numbers in alike.items():
+        for (_, name), numbers in alike.items():
             entries = [submission.entries[number] for number in numbers]
             chosen = [cfgs[entry.configuration] for entry in entries]
             plans = [entry.actions for entry in entries if entry.actions is not None]
@@ -135,7 +134,7 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
     for entry in submission.entries:
         one = entry.configuration
         cfg = found[one] = found.get(one) or one.config(overrides)
-        if entry.checksum != checksum(cfg, one.targets):
+        if entry.checksum != checksum(cfg):
             raise SubmissionError(
                 f"{submission.path}: the scene or target of {one.name} is another one than here: give the "
                 f"overrides that it was made with, or use its plab {versions}"
