@@ -170,9 +170,7 @@ class Problem:
 
         Raises:
             plab.config.ConfigError: If the configurations are incompatible.
-            plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
-            plab.targets.TargetError: If a target cannot be built.
-            plab.sim.DeviceError: If CUDA is not available.
+            plab.targets.TargetError: If a target cannot be built; see also :func:`make_simulator`.
         """
         _require_alike(cfgs)
         # Vectorised environments and seeds of a sweep often have equal scenes, which are built once.

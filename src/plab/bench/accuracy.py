@@ -23,7 +23,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -195,9 +195,12 @@ class Attempt:
             x = np.concatenate(parts)
         else:
             x = sample_particles(scene)
-        values = {field.name: getattr(scene, field.name) for field in fields(Scene)}
-        values |= {"grid_size": setting.grid, "substeps": setting.substeps}
-        return UncheckedScene(**values | {"dt": STEP_TIME / setting.substeps}), x
+        changes = {
+            "grid_size": setting.grid,
+            "substeps": setting.substeps,
+            "dt": STEP_TIME / setting.substeps,
+        }
+        return UncheckedScene(**vars(scene) | changes), x
 
     def run(self, setting: Resolution, repeats: int) -> dict[str, Result]:
         """Simulate and time one setting, and return a result per contact model. The first setting of an axis

@@ -129,6 +129,12 @@ def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictC
     return config
 
 
+def _without_hydra(composed: DictConfig) -> DictConfig:
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed
+
+
 def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
     """Return Hydra's composition of prepared overrides, including its own section; see :func:`compose`."""
     folder = [] if config_dir is None else [f"file://{Path(config_dir).expanduser().resolve()}"]
@@ -148,12 +154,6 @@ def hydra_app() -> Hydra:
     """Return a Hydra application for plab's files, independent of other applications."""
     version.setbase("1.3")
     return Hydra("plab", ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_folder()))))
-
-
-def _without_hydra(composed: DictConfig) -> DictConfig:
-    with open_dict(composed):
-        del composed["hydra"]
-    return composed
 
 
 def _sets_a_value(override: Override) -> bool:
@@ -360,12 +360,11 @@ def _refuse_undone(
 
 def _choose_profile(method: DictConfig) -> None:
     """Resolve references to the chosen profile, and remove the profiles."""
-    if "profiles" not in method or (method.profile is None and not method.profiles):
-        return
-    if method.profile not in method.profiles:
-        chosen, names = str(method.profile), [str(name) for name in method.profiles]
-        raise ConfigError(f"method.profile '{chosen}' does not exist; {pick(chosen, names)}")
-    _resolve(method, ["profiles"])
+    if method.get("profile") is not None or method.get("profiles"):
+        if method.profile not in method.profiles:
+            advice = pick(str(method.profile), list(map(str, method.profiles)))
+            raise ConfigError(f"method.profile '{method.profile}' does not exist; {advice}")
+        _resolve(method, ["profiles"])
 
 
 def _resolve(section: DictConfig, tables: Iterable[str]) -> None:

@@ -22,15 +22,7 @@ SCORES = "scores.csv"
 
 
 def load_actions(task: str, variant: str) -> np.ndarray | None:
-    """Return the recorded demonstration of a configuration of the suite.
-
-    Args:
-        task: Name of the task.
-        variant: Name of the variant.
-
-    Returns:
-        Actions in [-1, 1], shape [T, A], or None if there is none.
-    """
+    """Return the recorded actions of a configuration of the suite, in [-1, 1], shape [T, A], if any."""
     path = FOLDER / f"{task}.csv"
     if not path.is_file():
         return None
@@ -40,16 +32,7 @@ def load_actions(task: str, variant: str) -> np.ndarray | None:
 
 
 def known_actions(cfg: Config) -> np.ndarray | None:
-    """Return the best known actions for a configuration: the script of its target, or recorded actions.
-
-    Args:
-        cfg: A configuration, also outside the suite.
-
-    Returns:
-        Actions in [-1, 1], shape [T, A]; None for a geometric target without a record.
-
-    Raises:
-        plab.targets.TargetError: If the target is invalid.
-    """
+    """Return the best known actions for a configuration, in [-1, 1], shape [T, A]: the script of its target,
+    or recorded actions; None for a geometric target without a record."""
     scripted = demonstration(build_scene(cfg), cfg.task.target)
     return load_actions(cfg.task.name, cfg.variant) if scripted is None else scripted

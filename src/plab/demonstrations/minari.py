@@ -27,8 +27,6 @@ EXAMPLE = Path(__file__).parent / "dataset"
 VERSION = "0.5.4"
 """Version of Minari's format."""
 
-_ARRAYS = ("actions", "rewards", "terminations", "truncations")
-
 
 class DatasetError(PlabError, ValueError):
     """A dataset cannot be read or written; the message names it and the reason."""
@@ -61,7 +59,7 @@ def write_dataset(
     env_spec: EnvSpec,
     about: Mapping[str, Any],
 ) -> list[Mapping[str, Any]]:
-    """Write a dataset atomically.
+    """Write a dataset atomically, and return the attributes of the episodes.
 
     Args:
         folder: Folder of datasets, such as ``MINARI_DATASETS_PATH`` names.
@@ -70,9 +68,6 @@ def write_dataset(
         spaces: Spaces of observations and actions.
         env_spec: Environment of minari's ``recover_environment``.
         about: Further metadata.
-
-    Returns:
-        The attributes of the episodes.
 
     Raises:
         DatasetError: If the dataset exists, or there are no episodes.
@@ -84,9 +79,14 @@ def write_dataset(
         attributes, steps = [], 0
         with h5py.File(beside / "main_data.hdf5", "w", track_order=True) as file:
             for number, episode in enumerate(episodes):
-                _write_episode(file.create_group(f"episode_{number}"), number, episode)
+                length, group = len(episode.rewards), file.create_group(f"episode_{number}")
+                group.attrs.update({"id": number, "total_steps": length, **episode.attributes})
+                ends = np.arange(length) == length - 1
+                arrays = {"terminations": np.zeros(length, bool), "truncations": ends}
+                names = ("observations", "actions", "rewards", "infos")
+                _write(group, {name: getattr(episode, name) for name in names} | arrays)
                 attributes.append(episode.attributes)
-                steps += len(episode.rewards)
+                steps += length
         if not attributes:
             raise DatasetError(f"{name}: no episode is left to write")
         metadata = {
@@ -104,20 +104,6 @@ def write_dataset(
         }
         (beside / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
     return attributes
-
-
-def _write_episode(group: h5py.Group, number: int, episode: Episode) -> None:
-    steps = len(episode.rewards)
-    group.attrs.update({"id": number, "total_steps": steps, **episode.attributes})
-    arrays = {
-        "observations": episode.observations,
-        "actions": episode.actions,
-        "rewards": episode.rewards,
-        "terminations": np.zeros(steps, bool),
-        "truncations": np.arange(steps) == steps - 1,
-        "infos": episode.infos,
-    }
-    _write(group, arrays)
 
 
 def _write(group: h5py.Group, arrays: Mapping[str, Any]) -> None:
@@ -171,9 +157,9 @@ def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episod
         with h5py.File(file) as opened:
             for number in range(min(metadata["total_episodes"], limit or metadata["total_episodes"])):
                 group = opened[f"episode_{number}"]
-                actions, rewards, *_ = (group[name][()] for name in _ARRAYS)
-                infos = _read(group["infos"]) if "infos" in group else {}
-                yield Episode(_read(group["observations"]), actions, rewards, infos, dict(group.attrs))
+                found = {name: _read(item) for name, item in group.items()}
+                parts = (found[name] for name in ("observations", "actions", "rewards"))
+                yield Episode(*parts, found.get("infos", {}), dict(group.attrs))
     except (OSError, KeyError) as error:
         raise DatasetError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
 

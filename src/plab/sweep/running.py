@@ -180,7 +180,9 @@ def plan(
     batches = []
     for group in groups.values():
         limit = _limit(group[0], size, sharing)
-        batches += _split(group, max(-(-len(group) // limit), -(-processes // len(groups))))
+        count = min(max(-(-len(group) // limit), -(-processes // len(groups))), len(group))
+        bounds = [len(group) * k // count for k in range(count + 1)]
+        batches += [group[a:b] for a, b in itertools.pairwise(bounds)]
     return batches
 
 
@@ -210,12 +212,6 @@ def _limit(cfg: Config, size: int | None, sharing: int) -> int:
     # Agents need no gradient, so its budget sim.memory_mb does not apply.
     room = most_environments(scene, cfg.sim.precision, cfg.sim.device) // sharing
     return max(1, room // asdict(cfg.method)["num_envs"])
-
-
-def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
-    count = min(count, len(group))
-    bounds = [len(group) * k // count for k in range(count + 1)]
-    return [list(group[a:b]) for a, b in itertools.pairwise(bounds)]
 
 
 def run_batches(
