@@ -55,7 +55,7 @@ def test_depth_and_labels_are_those_of_closed_forms(camera):
     np.testing.assert_allclose(depth[labels == FIRST_MANIPULATOR], exact[np.isfinite(exact)], atol=1e-3)
     # The surface of plasticine is rough by its particles, its outline right to a pixel.
     body, shape = labels == FIRST_BODY, np.isfinite(ball_depth(camera, where, 0.12))
-    pixel = 1.5 * camera.pixel_size(SIZE[1])
+    pixel = 1.5 * np.linalg.norm(np.subtract(camera.position, camera.target)) / camera.focal_length
     assert not (body & np.isnan(ball_depth(camera, where, 0.12 + pixel))).any()
     assert body[np.isfinite(ball_depth(camera, where, 0.12 - pixel))].all()
     assert abs(body.sum() / shape.sum() - 1.0) < 0.1

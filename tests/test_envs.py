@@ -146,7 +146,7 @@ def test_wrong_actions_and_options_are_refused(env: PlabEnv, vector: PlabVectorE
         with pytest.raises(ValueError, match="reset_mask"):
             vector.reset(options={"reset_mask": np.array(mask)})
     for one in (env, vector):
-        with pytest.raises(ValueError, match="'start'"):
+        with pytest.raises(ValueError, match="options: start"):
             one.reset(options={"start": 1})
 
 
@@ -331,7 +331,7 @@ def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
     with pytest.raises(AttributeError, match="'jump'"):
         env.env_method("jump")
     env.set_options({"start": 1})
-    with pytest.raises(ValueError, match="'start'"):
+    with pytest.raises(ValueError, match="options: start"):
         env.reset()
 
 

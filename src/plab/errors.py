@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that enables tracebacks of bugs."""
@@ -33,6 +33,15 @@ class ArgumentError(PlabError, ValueError):
 
 class ConfigError(PlabError, ValueError):
     """An invalid configuration; the message is one line with the problem and the remedy."""
+
+
+@contextmanager
+def located(place: str, kind: type[PlabError] = ConfigError) -> Iterator[None]:
+    """Convert errors inside the ``with`` block to ``kind``, with a message that begins with a place."""
+    try:
+        yield
+    except PlabError as error:
+        raise kind(f"{place}: {error}") from None
 
 
 def pick(name: str, names: Sequence[str]) -> str:

@@ -326,8 +326,9 @@ class Problem:
         """
         result = self.simulator.rollout(actions, gradient=gradient, strict=strict)
         mass, ious = self.simulator.mass_tensor() if exact else None, result.step_iou[:, -1].tolist()
-        for e in set(range(len(ious))) - set(result.failures) if mass is not None else ():
-            ious[e] = soft_iou(mass[e], self.target_mass[e])
+        for e, own in enumerate(() if mass is None else mass):
+            if e not in result.failures:
+                ious[e] = soft_iou(own, self.target_mass[e])
         return Episodes(
             term_names=self.term_names,
             terms=result.step_terms,

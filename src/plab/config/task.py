@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from plab.config import ranges
-from plab.errors import ConfigError
-from plab.files import ShapeError, pinned
+from plab.errors import ConfigError, located
+from plab.files import pinned
 from plab.scenes import (
     MATERIAL_KEYS,
     Body,
@@ -173,29 +173,20 @@ class KinematicsConfig(ranges.Section):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
     def build(self) -> Chain:
-        """Return the scene's articulated model.
-
-        Raises:
-            ConfigError: If the model cannot be read or has changed, or a pattern matches nothing.
-        """
-        from plab.kinematics import ModelError
-
-        try:
-            patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
-            return self._read().placed(self.position, self.rotation, self.free, **patterns)
-        except ModelError as error:
-            raise ConfigError(f"task.kinematics: {error}") from None
+        """Return the scene's articulated model; ConfigError if it cannot be read or has changed, or a pattern
+        matches nothing."""
+        patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
+        with located("task.kinematics"):
+            chain = self._read().placed(self.position, self.rotation, self.free, **patterns)
+        return chain
 
     def pin(self) -> None:
-        """Replace the model's name by its path, unless it is in a package, and add its SHA-256; errors as for
-        :meth:`build`."""
-        from plab.kinematics import ModelError, locate_model
+        """Replace the model's name by its path, unless it is in a package, and add its SHA-256."""
+        from plab.kinematics import locate_model
 
-        try:
+        with located("task.kinematics"):
             self.model = locate_model(self.model)
             self._read()
-        except (ModelError, ShapeError) as error:
-            raise ConfigError(f"task.kinematics: {error}") from None
 
     def _read(self) -> Chain:
         # Imported here, as above: few tasks have an articulated model.
@@ -341,18 +332,13 @@ class TaskConfig(ranges.Section):
                 raise ConfigError(f"{path}.cameras.{name}: {error}") from None
 
     def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
-        """Return the scene's bodies, see :meth:`BodyConfig.build`.
-
-        Raises:
-            ConfigError: If a body is invalid; the message names its key.
-        """
+        """Return the scene's bodies, see :meth:`BodyConfig.build`; ConfigError names the key of an invalid
+        one."""
         bodies = []
         for name, body in self.bodies.items():
-            try:
+            with located(f"task.bodies.{name}"):
                 bodies.append(body.build(particles_scale))
                 find_law(bodies[-1].law or "von_mises")
-            except (ConfigError, SceneError, ShapeError) as error:
-                raise ConfigError(f"task.bodies.{name}: {error}") from None
         return tuple(bodies)
 
     def build_tools(self) -> dict[str, Any]:
@@ -363,11 +349,8 @@ class TaskConfig(ranges.Section):
         return {"manipulators": tools + links, "kinematics": chain}
 
     def pin_files(self) -> None:
-        """Replace the name of each file by its path, and add the SHA-256 of its content.
-
-        Raises:
-            ConfigError: If a file is missing, unreadable or of another kind; the message names its key.
-        """
+        """Replace the name of each file by its path, and add the SHA-256 of its content; ConfigError names
+        the key of a file that is missing, unreadable or of another kind."""
         if self.kinematics is not None:
             self.kinematics.pin()
         # The file of a variant has its own hash, independent of the task's.
@@ -381,7 +364,5 @@ def _pin(node: Any, path: str) -> None:
     for key, value in node.items():
         _pin(value, f"{path}.{key}")
     if isinstance(node.get("file"), str):
-        try:
+        with located(path):
             node["file"], node["sha256"] = pinned(os.path.expanduser(node["file"]), node.get("sha256"))
-        except ShapeError as error:
-            raise ConfigError(f"{path}: {error}") from None

@@ -158,8 +158,8 @@ def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episod
             for number in range(min(metadata["total_episodes"], limit or metadata["total_episodes"])):
                 group = opened[f"episode_{number}"]
                 found = {name: _read(item) for name, item in group.items()}
-                parts = (found[name] for name in ("observations", "actions", "rewards"))
-                yield Episode(*parts, found.get("infos", {}), dict(group.attrs))
+                seen, actions, rewards = (found[name] for name in ("observations", "actions", "rewards"))
+                yield Episode(seen, actions, rewards, found.get("infos", {}), dict(group.attrs))
     except (OSError, KeyError) as error:
         raise DatasetError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
 

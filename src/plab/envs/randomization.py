@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from plab.config import Config, ConfigError, build_scene
+from plab.config import Config, build_scene
 from plab.config.randomization import (
     NOISE,
     SCENE,
@@ -27,11 +27,11 @@ from plab.config.randomization import (
     with_values,
     yaws,
 )
-from plab.errors import ArgumentError
+from plab.errors import ArgumentError, located
 from plab.problem import Problem, drawn_scenes, make_targets, target_distance
-from plab.scenes import Scene, SceneError, sample_particles
+from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator
-from plab.targets import RECIPES, TargetError, build_target
+from plab.targets import RECIPES, build_target
 from plab.targets.recipes import TensorRecipe
 
 Target = tuple[np.ndarray, np.ndarray]
@@ -84,11 +84,8 @@ class EpisodeRandomizer:
         self._targets: list[Any] = [None for _ in cfgs]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
         for cfg in unique.values():
-            try:
-                ends = extremes(cfg) if cfg.task.randomize else []
-                self.scenes += [self._checked(one) for one in ends]
-            except (ConfigError, SceneError, TargetError) as error:
-                raise ConfigError(f"task.randomize: {error}") from None
+            with located("task.randomize"):
+                self.scenes += [self._checked(one) for one in (extremes(cfg) if cfg.task.randomize else [])]
 
     @property
     def changed(self) -> bool:
@@ -137,10 +134,8 @@ class EpisodeRandomizer:
         for e, own in values.items():
             base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]
             cfg = with_values(base.cfg, own)
-            try:
+            with located(", ".join(own), ArgumentError):
                 scenes[e] = self._checked(cfg)
-            except (ConfigError, SceneError, TargetError) as error:
-                raise ArgumentError(f"{', '.join(own)}: {error}") from None
             place = base, yaws(cfg.task, own), _places(scenes[e])
             if place != self._placed[e]:
                 particles[e] = _moved(*place)
@@ -162,12 +157,9 @@ class EpisodeRandomizer:
         if pool:
             values[SCENE] = int(rng.integers(len(pool)))
         for key, value in given.items():
-            path = f"options['{key}']"
-            try:
-                each = np.shape(value) == (len(self._cfgs), *np.shape(present_value(cfg.task, key, path)))
-                values[key] = checked(cfg.task, key, value[e] if each else value, path)
-            except ConfigError as error:
-                raise ArgumentError(str(error)) from None
+            with located("options", ArgumentError):
+                each = np.shape(value) == (len(self._cfgs), *np.shape(present_value(cfg.task, key, key)))
+                values[key] = checked(cfg.task, key, value[e] if each else value, key)
         if SCENE in values and values[SCENE] not in range(len(pool)):
             raise ArgumentError(
                 f"options['scene']: {values[SCENE]} is not below task.randomize.scenes={len(pool)}"
@@ -187,12 +179,11 @@ class EpisodeRandomizer:
             if cfg.task.target != base.cfg.task.target:
                 raise ArgumentError("this target is made once: draw among task.randomize.scenes")
             return base.target
-        try:
+        with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
             same = np.array_equal(mass, base.target[0])
-            return base.target if same else (mass, target_distance(mass))
-        except TargetError as error:
-            raise ArgumentError(str(error)) from None
+            target = base.target if same else (mass, target_distance(mass))
+        return target
 
 
 def _places(scene: Scene) -> list[Any]:

@@ -69,10 +69,6 @@ class Camera:
     def _focal_length(self, height: int) -> float:
         return height / 2 / math.tan(math.radians(self.field_of_view) / 2)
 
-    def pixel_size(self, height: int) -> float:
-        """Return the size of a pixel at the target [domain units], in pictures of some height [pixels]."""
-        return math.dist(self.position, self.target) / self._focal_length(height)
-
     def intrinsics(self) -> np.ndarray:
         """Return the matrix from camera coordinates (x right, y down, z forward) to pixels, shape [3, 3]."""
         width, height = self.size

@@ -12,8 +12,9 @@ import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.errors import located
 from plab.plugins import Registry
-from plab.scenes import Scene, SceneError
+from plab.scenes import Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore
 
@@ -132,8 +133,6 @@ def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
     material: dict[str, Any] = getattr(recipe, "material", {})
     made_from = replace(scene, particle_seed=0, **material)
     if material:
-        try:
+        with located("target", TargetError):
             made_from.validate()
-        except SceneError as error:
-            raise TargetError(f"target: {error}") from None
     return made_from

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from plab.errors import PlabError
+from plab.errors import PlabError, located
 from plab.files import ShapeError, one_line, pinned, read_array
 from plab.objective import spread_mass
-from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
+from plab.scenes import Body, Scene, make_body, sample_particles
 
 TARGET_SEED = 1
 """Seed of a target's samples; different from the scene's, so that targets are not shifted copies of the
@@ -31,15 +29,6 @@ EPISODE_STEPS = 50
 
 class TargetError(PlabError, ValueError):
     """A target cannot be built; the message has the reason."""
-
-
-@contextmanager
-def _located(place: str) -> Iterator[None]:
-    """Add the place to errors of scenes and files."""
-    try:
-        yield
-    except (SceneError, ShapeError) as error:
-        raise TargetError(f"{place}: {error}") from None
 
 
 class Recipe:
@@ -119,7 +108,7 @@ class BodiesTarget(PointsRecipe):
         for name, body in self.bodies.items():
             if len(body.center) != 3:
                 raise TargetError(f"target.bodies.{name}.center must be 3 numbers, not {body.center}")
-            with _located(f"target.bodies.{name}"):
+            with located(f"target.bodies.{name}", TargetError):
                 solids.append(body.build(1))
         volumes = np.array([solid.volume for solid in solids])
         if not np.all(volumes > 0):
@@ -129,7 +118,7 @@ class BodiesTarget(PointsRecipe):
         counts = np.diff(ends, prepend=0)
         bodies = tuple(replace(solid, particles=int(n)) for solid, n in zip(solids, counts, strict=True))
         filled = replace(scene, bodies=bodies, particle_seed=int(rng.integers(2**31)))
-        with _located("target"):
+        with located("target", TargetError):
             filled.validate()
         return sample_particles(filled)
 
@@ -202,7 +191,7 @@ class PointsTarget(PointsRecipe):
         # Imported here, because SciPy would slow down every `--help`.
         from scipy.spatial import KDTree
 
-        with _located("target"):
+        with located("target", TargetError):
             points = read_points(*pinned(self.file, self.sha256))
         some = points[:: -(-len(points) // _MEASURED)]
         distance = float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
@@ -252,7 +241,7 @@ class MassTarget(TensorRecipe):
     sha256: str | None = None
 
     def mass(self, scene: Scene) -> np.ndarray:
-        with _located("target"):
+        with located("target", TargetError):
             mass = _read_tensor(*pinned(self.file, self.sha256))
         n = scene.grid_size
         if mass.shape != (n, n, n):

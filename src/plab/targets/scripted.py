@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plab.errors import located
 from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
@@ -370,7 +371,7 @@ class GestureTarget(Script):
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
         """See :meth:`Script.sample`."""
         # Imported here: few tasks have an articulated model.
-        from plab.kinematics.chain import ModelError, matched
+        from plab.kinematics.chain import matched
 
         chain = scene.kinematics
         if chain is None:
@@ -382,10 +383,8 @@ class GestureTarget(Script):
             goal: dict[str, float] = {}
             for pattern, limits in posture.joints.items():
                 value = _draw(rng, f"postures[{number}].joints.{pattern}", limits)
-                try:
-                    goal |= matched(f"target.postures[{number}]", {pattern: value}, list(joints))
-                except ModelError as error:
-                    raise TargetError(str(error)) from None
+                with located("target", TargetError):
+                    goal |= matched(f"postures[{number}]", {pattern: value}, list(joints))
             shares = {name: (to - at[name]) / joints[name].scale for name, to in goal.items()}
             steps = max(posture.steps, math.ceil(max(map(abs, shares.values()), default=0.0) - 1e-9))
             row = np.zeros(scene.action_dim)
