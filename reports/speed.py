@@ -38,7 +38,7 @@ speed = benchmark(BENCH, SPEED)
 # ## Time per environment step
 
 # %%
-ours, compared = timing(runs, speed)
+(compared,) = timing(runs, speed)
 show_table(compared)
 
 
@@ -77,9 +77,6 @@ show_figure(drawing)
 # %% [markdown]
 # Runs that share a simulator share its time, so the time per step decreases with the number of runs. It is
 # the cost in a sweep, not the latency of a step, which the rows of the benchmark with batch 1 show.
-
-# %%
-show_table(ours)
 
 # %% [markdown]
 # ## Where the time of a run goes

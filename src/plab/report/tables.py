@@ -449,57 +449,57 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
 
 # ----------------------------------------------------------------------------------------------------- timing
 
-_BENCHMARK = (
-    ("forward_ms", "forward", "forward_ms"),
-    ("gradient_ms", "forward + backward", "forward_backward_ms"),
-)
-"""Column of the benchmark's file, measured calls, and the paper's column."""
-
-_TIMES = (
-    "Milliseconds per environment step of one environment, mean ± standard deviation, measured by "
-    "the runs themselves, without building and compiling; runs computed in one batch, of which each has its "
-    "share, count once (in brackets: how many measurements). "
-    "Gradient methods: forward, backward, measures, update. RL: simulation, loss and learning, without "
-    "evaluations."
-)
+_TIMES = [
+    "Milliseconds per environment step of one environment, mean ± standard deviation (in brackets: how many "
+    "measurements). Runs measure themselves, without building and compiling; runs computed in one batch, of "
+    "which each has its share, count once. Forward + backward: also measures and update. RL: simulation, loss "
+    "and learning, without evaluations.",
+    "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our measurements, "
+    "for the paper gives no spread.",
+]
 
 
 def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Return times per environment step and task: ours, and compared with the paper's.
+    """Return times per environment step and task, beside the paper's.
 
     Args:
         runs: Our runs.
         benchmark: Table of ``plab bench speed --paper --csv``, or None.
     """
-    tasks, steps = ordered_tasks(runs.tasks), _step_times(runs)
     paper = paper_table("timing").set_index("task")
-    cells, data, compared = [], [], []
-    for task in tasks:
-        own = steps[steps["task"] == task]
-        for device in sorted(set(own["device"])) or [NOTHING]:
-            shown = {"task": task, "device": device}
-            for kind, title in (("gradient", "gradient methods [ms]"), ("training", "RL [ms]")):
-                chosen = own[(own["device"] == device) & (own["kind"] == kind)]
-                # Runs of one batch share their time and count as one measurement.
-                mine = summarise(np.unique(chosen["ms"].to_numpy(float).round(9)))
-                shown[title] = _measured(mine)
-                numbers = {"ms": mine.mean, "std": mine.std, "measurements": mine.count}
-                data.append({"task": task, "device": device, "kind": kind} | numbers)
-                if kind == "gradient" and task in paper.index and mine.count:
-                    printed = float(paper.loc[task, "forward_backward_ms"])
-                    compared.append((task, "forward + backward", f"runs, {device}", mine, printed))
-            cells.append(shown)
+    steps, nothing = _step_times(runs), float("nan")
+    measured: list[tuple[str, str, str, Summary, float]] = []
+    for task in ordered_tasks(runs.tasks):
+        for (device, kind), own in steps[steps["task"] == task].groupby(["device", "kind"]):
+            # Runs of one batch share their time and count as one measurement.
+            ms = summarise(np.unique(own["ms"].round(9)))
+            theirs = paper["forward_backward_ms"].get(task, nothing) if kind == _GRADIENT else nothing
+            measured.append((task, kind, f"runs, {device}", ms, theirs))
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
             where = [row["device"], *([row["precision"]] if "precision" in row else [])]
             where = f"benchmark, {', '.join(where)}, batch {row['batch']}"
-            for column, kind, name in _BENCHMARK:
-                compared.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
-    notes = [_TIMES, *settings_note(runs)]
-    ours, title = pd.DataFrame(cells), "Time per environment step, plab"
-    return [
-        Table("timing", "ours", title, ours, pd.DataFrame(data), notes=notes),
-        _compared_times(compared, [*origin(benchmark), *settings_note(runs)]),
-    ]
+            for column, kind, name in (
+                ("forward_ms", "forward", "forward_ms"),
+                ("gradient_ms", _GRADIENT, "forward_backward_ms"),
+            ):
+                measured.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
+    data, cells = [], []
+    for task, kind, where, mine, theirs in measured:
+        # The paper gives no standard deviation, so the interval is ours.
+        gap, ratio = stratified_difference([mine], [Summary(theirs, 0.0, 2)]), theirs / mine.mean
+        which = {"task": task, "measured": where, "what": kind, "measurements": mine.count}
+        which |= {"ms": mine.mean, "std": mine.std, "paper_ms": theirs}
+        data.append(which | {"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": ratio})
+        shown = f"{mean_and_std(mine)} ({mine.count})", number(theirs), number(gap.value, sign=True)
+        cells.append((task, kind, where, *shown, ends(gap), number(ratio, 1)))
+    columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
+    table = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
+    numbers = pd.DataFrame(data, columns=None if data else ["task", "measured", "what", "measurements", "ms"])
+    notes = [*_TIMES, *origin(benchmark), *settings_note(runs)]
+    return [Table("timing", "comparison", "Time per environment step", table, numbers, None, notes, True)]
+
+
+_GRADIENT = "forward + backward"
 
 
 def _step_times(runs: Runs) -> pd.DataFrame:
@@ -508,9 +508,9 @@ def _step_times(runs: Runs) -> pd.DataFrame:
     if table.empty:
         return pd.DataFrame(columns=["task", "device", "kind", "ms"])
     family, horizon = table["method.family"], table["sim.horizon"].astype(float)
-    kind = family.map({"trajectory": "gradient", "rl": "training"})
+    kind = family.map({"trajectory": _GRADIENT, "rl": "RL"})
     # A run's first iteration counts as compilation.
-    steps = np.where(kind == "gradient", table["iterations"] - 1, table["method.episodes"]) * horizon
+    steps = np.where(kind == _GRADIENT, table["iterations"] - 1, table["method.episodes"]) * horizon
     optimise = table.get("seconds_optimise", pd.Series(np.nan, table.index))
     ms = 1e3 * optimise / np.where(steps > 0, steps, np.nan)
     device = [
@@ -518,34 +518,6 @@ def _step_times(runs: Runs) -> pd.DataFrame:
         for device, batch in zip(table["device"], table["batch"], strict=True)
     ]
     return pd.DataFrame({"task": table["task"], "device": device, "kind": kind, "ms": ms}).dropna()
-
-
-def _measured(ms: Summary) -> str:
-    return f"{mean_and_std(ms)} ({ms.count})" if ms.count else NOTHING
-
-
-def _compared_times(times: Sequence[tuple[str, str, str, Summary, float]], more: list[str]) -> Table:
-    """Return the table of task, measured calls, place of the measurement, our times and the paper's."""
-    data, cells = [], []
-    for task, kind, where, mine, theirs in times:
-        # The paper gives no standard deviation, so the interval is ours.
-        gap, ratio = stratified_difference([mine], [Summary(theirs, 0.0, 2)]), theirs / mine.mean
-        which = {"task": task, "measured": where, "what": kind, "measurements": mine.count}
-        which |= {"ms": mine.mean, "std": mine.std, "paper_ms": theirs}
-        data.append(which | {"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": ratio})
-        shown = _measured(mine), number(theirs), number(gap.value, sign=True), ends(gap), number(ratio, 1)
-        cells.append((task, kind, where, *shown))
-    notes = [
-        _TIMES,
-        "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
-        "measurements, for the paper gives no spread.",
-        *more,
-    ]
-    columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
-    table = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
-    numbers = pd.DataFrame(data, columns=None if data else ["task", "measured", "what", "measurements", "ms"])
-    title = "Time per environment step, compared"
-    return Table("timing", "comparison", title, table, numbers, None, notes, True)
 
 
 # ------------------------------------------------------------------------------------------ hyper-parameters
