@@ -30,7 +30,6 @@ from plab.report.statistics import (
     band,
     improvement,
     interquartile_mean,
-    performance_profile,
     shared_strata,
     strata_of,
 )
@@ -148,7 +147,6 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
 
 # ------------------------------------------------------------------------------------------------------ runs
 
-_SHADED = "Lines: mean over the runs; shaded: one standard deviation."
 _POINTS = 60
 """Points of a curve against budgets."""
 
@@ -157,40 +155,25 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
     """Return reward against episodes, per task and per configuration, all methods on one axis."""
     notes = [
         "Reward of an episode (sum over its steps) against episodes simulated so far, its own included.",
-        _SHADED,
+        "Lines: mean over the runs; shaded: one standard deviation.",
         "Values below zero count as zero, as in the paper.",
         *settings_note(runs),
     ]
+
+    def draw(panel: Axes, task: str) -> None:
+        _rewards(panel, runs, _pick(series, task=task))
+
     tasks = _tasks_with_runs(runs)
     figure, axes = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
     for panel, (task, variant) in zip(axes.flat, itertools.product(tasks, runs.variants), strict=True):
         panel.set_title(f"{task}-v{variant}")
-        _bands(panel, runs, _pick(series, task=task, variant=variant), "episodes", "reward")
+        _rewards(panel, runs, _pick(series, task=task, variant=variant))
     figure.supxlabel("episodes", fontsize=8)
     figure.supylabel("reward", fontsize=8)
     legend(figure)
     return [
-        Drawing("reward_per_task", _mean_curves(runs, series, "episodes", "reward", "episodes"), notes),
+        Drawing("reward_per_task", _per_task(runs, draw, "episodes", "reward"), notes),
         Drawing("reward_per_configuration", figure, notes),
-    ]
-
-
-def score_curves(runs: Runs, series: Series) -> list[Drawing]:
-    """Return score against wall time and against simulated substeps, per task."""
-    notes = [
-        "Score of each row of the results: RL methods in the hard contact model, gradient methods in that of "
-        "their rollouts, so that their ends may differ from the final evaluation.",
-        "Wall time of the rows, with compilation in the first one; of runs in one batch each one's share.",
-        "Bands end where the first of their runs ends.",
-        _SHADED,
-        *settings_note(runs),
-    ]
-    return [
-        Drawing(name, _mean_curves(runs, series, axis, "score", label), notes)
-        for name, axis, label in (
-            ("score_against_time", "seconds", "wall time [s]"),
-            ("score_against_substeps", "substeps", "simulated substeps"),
-        )
     ]
 
 
@@ -221,21 +204,12 @@ def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
     return found
 
 
-def _bands(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]], axis: str, column: str) -> None:
-    """Draw mean and spread of a column of all methods against a logarithmic axis."""
-    ceiling = 1.0 if column == "score" else np.inf
+def _rewards(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]]) -> None:
+    """Draw mean and spread of the reward of all methods against episodes."""
     for name in runs.methods:
-        if (one := band(tables.get(name, []), axis, column)) is not None:
-            low, high = (one.mean - one.std).clip(0.0), (one.mean + one.std).clip(max=ceiling)
-            draw_range(panel, name, one.x, one.mean, low, high)
-    panel.set(ylim=(0.0, 1.05 if column == "score" else None), xscale="log" if tables else "linear")
-
-
-def _mean_curves(runs: Runs, series: Series, axis: str, column: str, label: str) -> Figure:
-    def draw(panel: Axes, task: str) -> None:
-        _bands(panel, runs, _pick(series, task=task), axis, column)
-
-    return _per_task(runs, draw, label, column)
+        if (one := band(tables.get(name, []), "episodes", "reward")) is not None:
+            draw_range(panel, name, one.x, one.mean, (one.mean - one.std).clip(0.0), one.mean + one.std)
+    panel.set(ylim=(0.0, None), xscale="log" if tables else "linear")
 
 
 def _per_task(runs: Runs, draw: Callable[[Axes, str], None], across: str, up: str) -> Figure:
@@ -327,15 +301,12 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
 
 
 def aggregates(runs: Runs) -> list[Drawing]:
-    """Return interquartile means, performance profiles and probabilities of improvement."""
+    """Return interquartile means and probabilities of improvement."""
     shared = shared_strata(runs)
     if not shared.keys:
         return []
     notes = [*shared.notes, *settings_note(runs)]
-    return [
-        draw(list(shared.strata), shared.strata, notes)
-        for draw in (_interquartile_means, _profiles, _improvements)
-    ]
+    return [draw(list(shared.strata), shared.strata, notes) for draw in (_interquartile_means, _improvements)]
 
 
 Strata = Mapping[str, Sequence[np.ndarray]]
@@ -356,18 +327,6 @@ def _interquartile_means(methods: Sequence[str], strata: Strata, notes: list[str
         xlabel="interquartile mean of the normalised incremental IoU",
     )
     return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
-
-
-def _profiles(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
-    figure, panel = single(width=4.2, height=2.8)
-    thresholds = np.linspace(0.0, 1.0, 101)
-    for name in methods:
-        draw_range(panel, name, thresholds, *performance_profile(strata[name], thresholds))
-    panel.set(
-        xlim=(0.0, 1.0), ylim=(0.0, 1.02), xlabel="normalised incremental IoU", ylabel="share of runs above"
-    )
-    legend(figure)
-    return Drawing("performance_profile", figure, ["Share of runs whose score is higher.", *notes])
 
 
 def _improvements(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:

@@ -19,7 +19,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
@@ -35,7 +34,6 @@ from plab.report.statistics import (
     improvement,
     interquartile_mean,
     load_series,
-    performance_profile,
     shared_strata,
 )
 from plab.report.tables import Cell, compare, ordered_tasks, settings_note
@@ -50,9 +48,6 @@ _POINTS = 160
 
 _DIGITS = 4
 """Significant digits of the curves' numbers."""
-
-_THRESHOLDS = 51
-"""Thresholds of a performance profile."""
 
 _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "configuration.js", "page.js")
 
@@ -174,21 +169,12 @@ def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -
 
 
 def _aggregates(runs: Runs) -> Mapping[str, Any]:
-    """Return interquartile means, performance profiles and probabilities of improvement, each with its
-    interval, and a note on the runs included."""
+    """Return interquartile means and probabilities of improvement with their intervals, and notes."""
     shared = shared_strata(runs)
     strata = shared.strata
-    thresholds = np.linspace(0.0, 1.0, _THRESHOLDS)
     return {
         "notes": shared.notes,
         "mean": {name: _ends(interquartile_mean(own)) for name, own in strata.items()},
-        "profile": {
-            "x": thresholds.round(4).tolist(),
-            "methods": {
-                name: np.round(performance_profile(own, thresholds), 4).tolist()
-                for name, own in strata.items()
-            },
-        },
         "better": {
             one: {other: _ends(improvement(strata[one], strata[other])) for other in strata if other != one}
             for one in strata

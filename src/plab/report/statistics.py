@@ -1,7 +1,7 @@
 """Statistics of scores: means, confidence intervals, curves and equal budgets, and aggregates over a suite by
 stratified bootstrap.
 
-Interquartile mean, performance profile and probability of improvement as in Agarwal et al., Deep
+Interquartile mean and probability of improvement as in Agarwal et al., Deep
 Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021). Strata are configurations;
 bootstrap samples have the same number of runs per configuration.
 """
@@ -119,23 +119,6 @@ def interquartile_mean(strata: Strata) -> Interval:
     middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
     found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
     return _interval(*found)
-
-
-def performance_profile(strata: Strata, thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fraction of runs with a score above each threshold.
-
-    Args:
-        strata: Scores.
-        thresholds: Thresholds, shape [threshold].
-
-    Returns:
-        Fractions and their pointwise percentile intervals, each of shape [threshold].
-    """
-    samples = _resampled(strata)
-    shares = np.stack([(samples > threshold).mean(axis=1) for threshold in thresholds])
-    low, high = np.quantile(shares, _ENDS, axis=1)
-    scores = np.concatenate(strata)
-    return np.array([(scores > threshold).mean() for threshold in thresholds]), low, high
 
 
 def improvement(ours: Strata, theirs: Strata) -> Interval:

@@ -452,10 +452,10 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
 _TIMES = [
     "Milliseconds per environment step of one environment, mean ± standard deviation (in brackets: how many "
     "measurements). Runs measure themselves, without building and compiling; runs computed in one batch, of "
-    "which each has its share, count once. Forward + backward: also measures and update. RL: simulation, loss "
-    "and learning, without evaluations.",
-    "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our measurements, "
-    "for the paper gives no spread.",
+    "which each has its share, count once. Forward + backward: also measures and update. RL: simulation, "
+    "loss and learning, without evaluations.",
+    "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
+    "measurements, for the paper gives no spread.",
 ]
 
 

@@ -88,7 +88,6 @@ def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
             series = load_series(runs)
             drawings += [
                 *figures.rewards(runs, series),
-                *figures.score_curves(runs, series),
                 figures.budget_curves(runs, series),
                 *figures.rl_scores(runs),
                 *figures.agreement_plot(runs),

@@ -21,7 +21,6 @@ import re
 import shutil
 import subprocess
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
@@ -30,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, SoftFileLock, Timeout
+from filelock import FileLock, Timeout
 
 from plab.config.run import config_dict, config_hash, member_name
 from plab.results.run_file import read, replace_file, write
@@ -318,15 +317,19 @@ def _move_aside(path: Path, reason: ResultsError) -> None:
 _PATIENCE = 0.2
 """Timeout of :func:`acquire` [s], longer than :func:`held` holds a lock."""
 
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""Error numbers of file systems without locks."""
+_NOT_HELD = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EROFS)
+"""Error numbers of file systems on which no run can be in progress: without locks, or read-only."""
 
 
 class Lock:
     """A lock held by this process until :meth:`release` or garbage collection."""
 
-    def __init__(self, lock: FileLock) -> None:
-        self._lock = lock
+    def __init__(self, path: str | Path, timeout: float = _PATIENCE) -> None:
+        """Acquire the lock of a run, as :func:`acquire` does; filelock.Timeout if it is held for longer."""
+        # The soft lock of a killed process would never be released.
+        options = {"thread_local": False, "fallback_to_soft": False}
+        self._lock = FileLock(lock_path(path), timeout, poll_interval=_PATIENCE / 8, **options)
+        self._lock.acquire()
 
     def release(self) -> None:
         """Release the lock and remove its file; further calls have no effect."""
@@ -352,74 +355,50 @@ def acquire(path: str | Path) -> Lock | None:
     Raises:
         OSError: If the lock file cannot be created, or its file system has no locks.
     """
-    try:
-        return _locked(lock_path(path), _PATIENCE)
-    except Timeout:
-        return None
+    with suppress(Timeout):
+        return Lock(path)
+    return None
 
 
 def held(path: str | Path) -> bool:
     """Return True if a run is in progress, given its final or partial result file."""
-    file = lock_path(path)
-    if not file.exists():
+    if not lock_path(path).exists():
         return False
     try:
         # Not locked: left by a killed process, or removed by its holder just before it was opened.
-        _locked(file, 0.0).release()
+        Lock(path, 0.0).release()
     except Timeout:
         return True
     except OSError as error:
-        # Without lock support, no other process can hold it. A file that cannot be opened belongs to another
-        # user.
-        return error.errno not in (*_NO_LOCKS, errno.EROFS)
+        # A file that cannot be opened belongs to another user.
+        return error.errno not in _NOT_HELD
     return False
-
-
-def _locked(file: Path, timeout: float) -> Lock:
-    lock = FileLock(file, timeout=timeout, poll_interval=_PATIENCE / 8, thread_local=False)
-    with warnings.catch_warnings():
-        # Warning about filelock's soft locks, used on file systems without locks.
-        warnings.simplefilter("ignore")
-        lock.acquire()
-    if isinstance(lock, SoftFileLock):
-        # The soft lock of a killed process would never be released.
-        lock.release()
-        raise OSError(errno.ENOSYS, "its file system has no locks: choose another results_dir")
-    return Lock(lock)
 
 
 # ------------------------------------------------------------------------------------------------- provenance
 
-_PACKAGES = (
-    "plab",
-    "taichi",
-    "quadrants",
-    "torch",
-    "numpy",
-    "gymnasium",
-    "stable_baselines3",
-    "h5py",
-    "hydra-core",
-)
+_PACKAGES = ("plab", "taichi", "quadrants", "torch", "numpy", "gymnasium")
+_PACKAGES += ("stable_baselines3", "h5py", "hydra-core")
 """Distributions with recorded versions. They are not imported, because torch alone takes seconds."""
 
 
 def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the provenance of a run that starts now.
-
-    Args:
-        config: Resolved configuration, with device, precision and seed.
+    """Return the provenance of a run with a resolved configuration that starts now.
 
     Returns:
         Flat scalars: versions, platform, commit, device, precision, seed, start time. ``git_commit`` is empty
         outside plab's repository.
     """
     commit, dirty = _git()
+    model = ""
+    with suppress(OSError):
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        model = found[1].strip() if found else ""
     return {
         **{name.removesuffix("-core"): _version(name) for name in _PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processor": _processor() or platform.processor(),
+        "processor": model or platform.processor(),
         "cpu_count": os.cpu_count() or 0,
         "git_commit": commit,
         "git_dirty": dirty,
@@ -441,14 +420,6 @@ def _version(distribution: str) -> str:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _processor() -> str:
-    """Return the CPU's model name on Linux, an empty text elsewhere."""
-    with suppress(OSError):
-        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-        return found[1].strip() if found else ""
-    return ""
 
 
 @functools.cache

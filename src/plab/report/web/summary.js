@@ -59,7 +59,7 @@ function showTasks() {
 }
 
 function showAggregates() {
-  const { mean, profile, better, notes } = content.aggregates;
+  const { mean, better, notes } = content.aggregates;
   const shown = methods.filter(({ name }) => mean[name]);
   if (!shown.length) return;
   const part = (value) => `${(100 * Math.min(Math.max(value, 0), 1)).toFixed(2)}%`;
@@ -69,12 +69,8 @@ function showAggregates() {
       make("span", { class: "track", style: `${own(name)}; --low: ${part(low)}; --high: ${part(high)}; --value: ${part(value)}` }, make("i"), make("b")),
       make("span", { class: "number" }, make("b", {}, fixed(value)), make("small", {}, ` [${fixed(low)}, ${fixed(high)}]`)));
   });
-  const [box] = chartBox("performance profile", shown, new Set(),
-    (visible) => visible.map(({ name, label, dashes }) => { const [y, low, high] = profile.methods[name]; return { name, label, dashes, x: profile.x, y, low, high }; }),
-    () => ({ log: false, bottom: 0, top: 1, label: "score", side: "share of runs above", heading: (x) => `share of runs above ${fixed(x)}` }));
   const panels = [
     make("div", { class: "panel", id: "mean" }, make("h3", {}, "Interquartile mean"), make("div", { class: "card" }, ...dots)),
-    make("div", { class: "panel", id: "profile" }, make("h3", {}, "Performance profile: share of runs above a score"), box),
   ];
   if (shown.length > 1) {
     const rows = shown.map((one) => make("tr", {}, make("th", {}, ...headOf(one)), ...shown.map((other) => {
