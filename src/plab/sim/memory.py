@@ -123,51 +123,6 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     return max(1, min(int(memory_mb * 1e6 / one), *numbered))
 
 
-def segment_length(
-    steps: int,
-    slots_per_step: int,
-    reach: int,
-    segments_max: int,
-    slot_bytes: int,
-    held: int,
-    memory_mb: float,
-) -> int:
-    """Return the number of environment steps per segment for a gradient over T ``steps``.
-
-    Args:
-        steps: Environment steps T.
-        slots_per_step: States stored per step.
-        reach: Number of steps whose states fit into one array.
-        segments_max: Number of states that fit into one array.
-        slot_bytes: Size of a state of all environments [bytes].
-        held: Memory of everything else [bytes].
-        memory_mb: Total memory budget [MB].
-
-    Returns:
-        The largest length that fits into the budget, reduced to segments of about equal length.
-
-    Raises:
-        MemoryError: If no length fits into the budget or into arrays that Taichi can address.
-    """
-    lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
-    if not lengths:
-        raise MemoryError(
-            f"a gradient of {steps} steps has more numbers than Taichi can address, whatever the memory: "
-            "simulate fewer environments together, or fewer steps"
-        )
-    cost = {n: kept_states(steps, slots_per_step, n, reach) * slot_bytes + held for n in lengths}
-    fitting = [length for length in lengths if cost[length] <= memory_mb * 1e6]
-    if not fitting:
-        need = math.ceil(min(cost.values()) / 1e6)
-        raise MemoryError(
-            f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
-            f"set sim.memory_mb={need} or more"
-        )
-    # Fewest recomputed steps first: as few segments as possible, of even length.
-    segments = -(-steps // max(fitting))
-    return -(-steps // segments)
-
-
 def held_bytes(*holders: object) -> int:
     """Return the memory of all fields and arrays among the attributes of objects, including lists [bytes]."""
     values = [value for holder in holders for value in vars(holder).values()]

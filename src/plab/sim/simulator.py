@@ -35,7 +35,7 @@ from plab.sim.state import (
     require_none,
     rest_state,
 )
-from plab.sim.tape import ClosedLoop, RecordedStates, Tape
+from plab.sim.tape import RecordedStates, Tape, closed_loop, record
 from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
 from plab.sim.term_phases import LossTerm
 
@@ -568,26 +568,7 @@ class Simulator:
             SimulationError: If the state stops being finite.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
-        array, steps, poses, plan = self._started(actions, gradient)
-        drive = self._drive
-        recording = RecordedStates(self._particles, actions, every_step, mass, steps)
-        self._tape.forward(array, poses, None, steps, plan, after=recording.note)
-        require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
-        self._engine.place(poses, steps, self._pose, 0)
-        shown = numbers_of(poses, (steps + 1, self.batch, self.manipulator_count, 8), actions)
-
-        def back() -> np.ndarray | torch.Tensor:
-            terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
-            before = self.steps_before_contact(steps)
-            with self._kept_weights():
-                self._engine.write(self._engine.term_weights, np.zeros(self._engine.term_weights.shape))
-                bars = self._tape.backward(array, poses, terms, steps, before, add=recording.add)
-            bar = self._by_actions(bars, steps, actions, drive)
-            require_none(broken_gradients(bar))
-            return bar
-
-        version = self._version
-        return recording.finish(shown[1:].swapaxes(0, 1), back, lambda: gradient and self._version == version)
+        return record(self, actions, every_step, mass, gradient)
 
     def closed_loop(
         self,
@@ -627,7 +608,7 @@ class Simulator:
         """
         if not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
-        return ClosedLoop(self, steps, choose, react, stride, discount, like).run()
+        return closed_loop(self, steps, choose, react, stride, discount, like)
 
     def state_gradient(self) -> State:
         """Return the gradient of the last :meth:`rollout`'s loss with respect to its initial state.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from plab.errors import ArgumentError
 from plab.sim.compiler import ti
-from plab.sim.memory import ENTRIES_MAX, held_bytes, segment_length
+from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
 from plab.sim.state import broken_gradients, broken_states, require_none
 from plab.sim.storage import AT_V
@@ -68,9 +69,14 @@ class Tape:
         return self._history[number], masked_index * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
-        """Return :func:`plab.sim.memory.segment_length` for a gradient of T ``steps``, within a budget for
-        everything that the simulator holds [MB]."""
-        engine, particles = self._engine, self._particles
+        """Return the number of environment steps per segment for a gradient over T ``steps``: the largest
+        that fits into a budget for everything that the simulator holds [MB], reduced to segments of about
+        equal length.
+
+        Raises:
+            MemoryError: If no length fits into the budget or into arrays that Taichi can address.
+        """
+        engine, particles, reach = self._engine, self._particles, self._reach_max
         engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
         held = held_bytes(engine, *engine.terms, particles, particles.order) + particles.slot_bytes
@@ -78,9 +84,23 @@ class Tape:
             # The orders of all steps, and the adjoint's other half.
             held += 4 * steps * particles.order.places + particles.slot_bytes
         segments_max = ENTRIES_MAX[engine.device] // particles.slot_entries
-        return segment_length(
-            steps, self._slots_per_step, self._reach_max, segments_max, particles.slot_bytes, held, memory_mb
-        )
+        lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
+        if not lengths:
+            raise MemoryError(
+                f"a gradient of {steps} steps has more numbers than Taichi can address, whatever the memory: "
+                "simulate fewer environments together, or fewer steps"
+            )
+        slots = {n: kept_states(steps, self._slots_per_step, n, reach) for n in lengths}
+        cost = {n: count * particles.slot_bytes + held for n, count in slots.items()}
+        fitting = [n for n in lengths if cost[n] <= memory_mb * 1e6]
+        if not fitting:
+            need = math.ceil(min(cost.values()) / 1e6)
+            raise MemoryError(
+                f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
+                f"set sim.memory_mb={need} or more"
+            )
+        # As few segments as possible, because their steps are recomputed.
+        return -(-steps // -(-steps // max(fitting)))
 
     def _allocate(self, steps: int) -> None:
         per_slot, segments = self._particles.current.shape[0], -(-steps // self._length)
@@ -240,47 +260,9 @@ class RecordedStates:
         mass: Mass tensors, shape [batch, T, n, n, n]; None if not requested.
     """
 
-    x: Any
-    v: Any
-    poses: Any
-    mass: Any
-
-    def __init__(self, particles: Particles, like: Any, every_step: bool, mass: bool, steps: int) -> None:
-        """Start without states for a rollout of T ``steps``, see :meth:`plab.sim.Simulator.record`. States
-        are tensors if the actions ``like`` are a CUDA tensor."""
-        self._particles, self._engine = particles, particles.engine
-        self._like = like if on_device(like) else None
-        self._first = 0 if every_step else steps - 1
-        self._rows: list[Any] = []
-        self._masses: list[Any] | None = [] if mass else None
-        # Particle numbers of each state, if particles are sorted.
-        self._numbers: list[ti.Ndarray] = []
-        self._bars: dict[str, Any] = {}
-
-    def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Copy the state after step t from the device."""
-        if t < self._first:
-            return
-        engine, numbers = self._engine, self._particles.order.noted()
-        self._numbers.append(numbers)
-        size = engine.batch * engine.particles * 6
-        self._rows.append(self._taken(size, lambda out: engine.observe(state, slot, numbers, 1, out)))
-        if self._masses is not None:
-            terms = ti.ndarray(ti.f64, shape=engine.batch * engine.measures)
-            self._particles.losses(terms, 0, state, slot)
-            self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
-
-    def finish(self, poses: Any, back: Callable[[], Any], is_current: Callable[[], bool]) -> RecordedStates:
-        """Complete the recorded states, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the
-        backward pass, valid while ``is_current``."""
-        e = self._engine
-        rows = self._stacked(self._rows).reshape(e.batch, -1, e.particles, 6)
-        self.x, self.v, self.poses, self.mass = rows[..., :3], rows[..., 3:], poses[:, self._first :], None
-        if self._masses is not None:
-            self.mass = self._stacked(self._masses).reshape(e.batch, -1, e.n, e.n, e.n)
-        self._rows, self._masses = [], None
-        self._back, self._is_current = back, is_current
-        return self
+    def __init__(self, x: Any, v: Any, poses: Any, mass: Any, back: Callable[[dict[str, Any]], Any]) -> None:
+        """Hold states of :func:`record`; ``back`` runs the backward pass with derivatives by name."""
+        self.x, self.v, self.poses, self.mass, self._back = x, v, poses, mass, back
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:
         """Return the gradient with respect to the actions of a function, given its derivatives with respect
@@ -313,167 +295,176 @@ class RecordedStates:
                 raise ArgumentError(
                     f"derivatives with respect to {name} have shape {np.shape(bar)}, not {shape}"
                 )
-        if not self._is_current():
+        chosen = {name: bar for name, bar in given.items() if bar is not None}
+        return self._back({k: bar if on_device(bar) else np.asarray(bar) for k, bar in chosen.items()})
+
+
+def record(
+    simulator: Simulator, actions: Any, every_step: bool, with_mass: bool, gradient: bool
+) -> RecordedStates:
+    """Simulate and record; arguments, results and errors of :meth:`plab.sim.Simulator.record`."""
+    engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
+    array, steps, poses, plan = simulator._started(actions, gradient)
+    drive, first = simulator._drive, 0 if every_step else steps - 1
+    # Particle numbers of each state, if particles are sorted.
+    numbers: list[ti.Ndarray] = []
+    rows: list[Any] = []
+    masses: list[Any] = []
+
+    def filled(size: int, fill: Callable[[Any], None]) -> Any:
+        """Return zeros that a kernel has added to, as an array or a tensor, shape [batch, number]."""
+        double = engine.real == ti.f64
+        if on_device(actions):
+            return output_for(lambda out: fill(out.zero_()), size, double, actions).reshape(engine.batch, -1)
+        out = np.zeros(size, np.float64 if double else np.float32)
+        fill(out)
+        return out.reshape(engine.batch, -1)
+
+    def note(t: int, state: ti.Ndarray, slot: int) -> None:
+        if t < first:
+            return
+        numbers.append(particles.order.noted())
+        size = engine.batch * engine.particles * 6
+        rows.append(filled(size, lambda out: engine.observe(state, slot, numbers[-1], 1, out)))
+        if with_mass:
+            particles.losses(ti.ndarray(ti.f64, shape=engine.batch * engine.measures), 0, state, slot)
+            masses.append(filled(engine.batch * engine.n**3, engine.export_mass))
+
+    def stacked(parts: list[Any], *shape: int) -> Any:
+        # A tensor implies that PyTorch is imported.
+        joined = sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
+        return joined.reshape(engine.batch, -1, *shape)
+
+    tape.forward(array, poses, None, steps, plan, after=note)
+    require_none(broken_states(engine.read(engine.fault), engine.substeps))
+    engine.place(poses, steps, simulator._pose, 0)
+    shown = numbers_of(poses, (steps + 1, engine.batch, engine.manipulators, 8), actions)
+    version = simulator._version
+
+    def back(bars: dict[str, Any]) -> Any:
+        if not gradient or simulator._version != version:
             raise RuntimeError(
                 "there is no gradient: record with gradient=True, and pull back before it runs again"
             )
-        self._bars = {name: self._by_step(bar) for name, bar in given.items() if bar is not None}
-        return self._back()
+        by_step = {name: [_flat(bar[:, k]) for k in range(bar.shape[1])] for name, bar in bars.items()}
 
-    def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
-        """Add the derivatives with respect to the state after step t, in ``slot`` of an array, to its
-        adjoint."""
-        k = t - self._first
-        if k < 0:
-            return
-        for name, first in (("x", 0), ("v", AT_V)):
-            if name in self._bars:
-                self._engine.add_cotangents(bar, self._numbers[k], self._bars[name][k], first)
-        if "mass" in self._bars:
-            self._engine.add_mass_cotangents(state, slot, bar, self._bars["mass"][k])
-        if "poses" in self._bars and self._engine.manipulators:
-            self._engine.add_pose_cotangents(self._bars["poses"][k])
+        def add(t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
+            """Add the derivatives with respect to the state after step t to its adjoint."""
+            k = t - first
+            if k < 0:
+                return
+            for name, entry in (("x", 0), ("v", AT_V)):
+                if name in by_step:
+                    engine.add_cotangents(bar, numbers[k], by_step[name][k], entry)
+            if "mass" in by_step:
+                engine.add_mass_cotangents(state, slot, bar, by_step["mass"][k])
+            if "poses" in by_step and engine.manipulators:
+                engine.add_pose_cotangents(by_step["poses"][k])
 
-    def _taken(self, size: int, fill: Callable[[Any], None]) -> Any:
-        """Return zeros that a kernel has added to, as an array or a tensor of ``size`` numbers."""
-        double = self._engine.real == ti.f64
-        if self._like is None:
-            out = np.zeros(size, np.float64 if double else np.float32)
-            fill(out)
-            return out
-        return output_for(lambda out: fill(out.zero_()), size, double, self._like)
-
-    def _stacked(self, parts: list[Any]) -> Any:
-        """States of all steps, each of [batch * number] numbers, as [batch, T, number]."""
-        rows = [part.reshape(self._engine.batch, -1) for part in parts]
-        # A tensor implies that PyTorch is imported.
-        return np.stack(rows, axis=1) if self._like is None else sys.modules["torch"].stack(rows, dim=1)
-
-    def _by_step(self, bar: Any) -> list[Any]:
-        """Return the derivatives with respect to the states of each step as flat arrays for kernels."""
-        steps = bar.detach() if on_device(bar) else np.asarray(bar)
-        return [_flat(steps[:, k]) for k in range(steps.shape[1])]
-
-
-class ClosedLoop:
-    """Environment steps with actions chosen from observations, and their backward pass.
-
-    Attributes:
-        actions: Actions of all steps so far.
-        actions_bar: Adjoints of the actions computed so far.
-        weights: Weights of the loss terms before discounting, shape [term]; set before the backward pass.
-    """
-
-    weights: np.ndarray
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        steps: int,
-        choose: Callable[[int, Any, Any], Any],
-        react: Callable[[int, Any], tuple[Any, Any] | None],
-        stride: int,
-        discount: float,
-        like: torch.Tensor | None,
-    ) -> None:
-        """Start from the current state; arguments as in :meth:`plab.sim.Simulator.closed_loop`."""
-        simulator._require_runtime()
-        self._simulator, self._engine, self._particles = simulator, simulator._engine, simulator._particles
-        self._steps, self._choose, self._react = steps, choose, react
-        self._stride, self._discount, self._like = stride, discount, like
-        self._drives: list[LinkMotion] = []
-        self._joints_bar: Any = None
-        engine = self._engine
-        self._row = engine.batch * engine.actions_per_step
-        self.actions = ti.ndarray(ti.f64, shape=max(1, steps * self._row))
-        self.actions_bar = ti.ndarray(ti.f64, shape=self.actions.shape)
-        self._poses = simulator._pose_history(steps, np.asarray(simulator.poses()))
-        # Particle order at each observation.
-        self._numbers: list[ti.Ndarray] = []
-
-    def run(self) -> np.ndarray | torch.Tensor:
-        """Simulate forward and back; results and errors of :meth:`plab.sim.Simulator.closed_loop`."""
-        simulator, engine, steps = self._simulator, self._engine, self._steps
-        simulator._version += 1
-        # Contact before these steps does not depend on their actions.
-        engine.write(engine.touched, np.zeros(engine.batch))
-        tape = simulator._tape
-        plan = tape.plan(steps, simulator.memory_mb)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
-        self.observe_step(0, self._particles.current, 0)
-        tape.forward(self.actions, self._poses, None, steps, plan, after=self.note)
-        require_none(broken_states(engine.read(engine.fault), engine.substeps))
-        before = simulator.steps_before_contact(steps)
-        with simulator._kept_weights() as self.weights:
-            tape.backward(self.actions, self._poses, terms, steps, before, self.add, self.actions_bar)
-        bars = numbers_of(self.actions_bar, (steps, engine.batch, engine.actions_per_step), self._like)
-        require_none(broken_gradients(bars.swapaxes(0, 1)))
-        self.react_at(0)
-        engine.place(self._poses, steps, simulator._pose, 0)
-        values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), self._like)
-        return simulator._judged(values).terms[1:].swapaxes(0, 1)
+        with simulator._kept_weights():
+            engine.write(engine.term_weights, np.zeros(engine.term_weights.shape))
+            before = simulator.steps_before_contact(steps)
+            by_motions = tape.backward(array, poses, terms, steps, before, add=add)
+        bar = simulator._by_actions(by_motions, steps, actions, drive)
+        require_none(broken_gradients(bar))
+        return bar
 
-    def observe_step(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Observe the state before step t, in a time slot of an array, and choose its actions."""
-        engine = self._engine
-        self._numbers.append(self._particles.order.noted())
-        shape = engine.batch, engine.manipulators, 8
-        poses = numbers_of(self._poses, shape, self._like, first=t * int(np.prod(shape)))
-        seen = self._simulator._observe(state, slot, self._stride, self._like)
-        chosen = self._choose(t, seen, poses)
-        if t < self._steps:
-            through = self._moved if self._simulator._map else None
-            row = kernel_actions(chosen, engine, self._simulator.action_dim, through)
-            copy_numbers(self.actions, t * self._row, row, self._row, 1)
+    moved = stacked(rows, engine.particles, 6)
+    mass = stacked(masses, engine.n, engine.n, engine.n) if with_mass else None
+    return RecordedStates(moved[..., :3], moved[..., 3:], shown[1:].swapaxes(0, 1)[:, first:], mass, back)
 
-    def _moved(self, actions: Any) -> Any:
-        self._drives.append(self._simulator._follow(actions))
-        return self._drives[-1].twists
 
-    def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Observe the state after step t."""
-        self.observe_step(t + 1, state, slot)
+def closed_loop(
+    simulator: Simulator,
+    steps: int,
+    choose: Callable[[int, Any, Any], Any],
+    react: Callable[[int, Any], tuple[Any, Any] | None],
+    stride: int,
+    discount: float,
+    like: torch.Tensor | None,
+) -> np.ndarray | torch.Tensor:
+    """Simulate forward and back; arguments, results and errors of :meth:`plab.sim.Simulator.closed_loop`."""
+    simulator._require_runtime()
+    engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
+    row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
+    seen_shape = engine.batch, -(-engine.particles // stride), 6
+    actions = ti.ndarray(ti.f64, shape=max(1, steps * row))
+    actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+    poses = simulator._pose_history(steps, np.asarray(simulator.poses()))
+    # Particle order at each observation, and motions of articulated models in each step.
+    numbers: list[ti.Ndarray] = []
+    drives: list[LinkMotion] = []
+    joints_bar: Any = None
 
-    def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
+    def moved(chosen: Any) -> Any:
+        drives.append(simulator._follow(chosen))
+        return drives[-1].twists
+
+    def observe(t: int, state: ti.Ndarray, slot: int) -> None:
+        """Observe the state before step t, and choose the actions of this step."""
+        numbers.append(particles.order.noted())
+        posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
+        chosen = choose(t, simulator._observe(state, slot, stride, like), posed)
+        if t < steps:
+            through = moved if simulator._map else None
+            given = kernel_actions(chosen, engine, simulator.action_dim, through)
+            copy_numbers(actions, t * row, given, row, 1)
+
+    def react_at(t: int) -> tuple[Any, Any] | None:
+        """Return the derivatives with respect to the observation before step t from the adjoint of its
+        actions, or those of the last observation."""
+        nonlocal joints_bar
+        if t == steps:
+            return react(t, None)
+        bar = numbers_of(actions_bar, (engine.batch, engine.actions_per_step), like, first=t * row)
+        if drives:
+            # From the last to the first step, because later steps depend on the joints of earlier ones.
+            by_actions, joints_bar = drives[t].pull_back(bar[None], joints_bar)
+            bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
+        return react(t, bar)
+
+    def add(t: int, _state: ti.Ndarray, _slot: int, bar: ti.Ndarray) -> None:
         """Add the contribution of the observation after step t to the adjoint of its state."""
-        if self._discount != 1.0:
-            self._engine.write(self._engine.term_weights, self.weights * self._discount**t)
-        given = self.react_at(t + 1)
+        if discount != 1.0:
+            engine.write(engine.term_weights, weights * discount**t)
+        given = react_at(t + 1)
         if given is None:
             return
-        engine, stride = self._engine, self._stride
-        moved, posed = given
-        expected = engine.batch, -(-engine.particles // stride), 6
-        if tuple(moved.shape) != expected or tuple(posed.shape) != (engine.batch, engine.manipulators, 8):
+        seen, posed = given
+        if (tuple(seen.shape), tuple(posed.shape)) != (seen_shape, posed_shape):
             raise ArgumentError(
-                f"derivatives with respect to the observation have shapes {tuple(moved.shape)} and "
-                f"{tuple(posed.shape)}, not {expected} and {(engine.batch, engine.manipulators, 8)}"
+                f"derivatives with respect to the observation have shapes {tuple(seen.shape)} and "
+                f"{tuple(posed.shape)}, not {seen_shape} and {posed_shape}"
             )
         for first in (0, AT_V):
-            whole = self._zeros(moved)
-            whole[:, ::stride] = moved[..., first : first + 3]
-            engine.add_cotangents(bar, self._numbers[t + 1], whole.reshape(-1), first)
+            shape = engine.batch, engine.particles, 3
+            whole = seen.new_zeros(shape) if on_device(seen) else np.zeros(shape, seen.dtype)
+            whole[:, ::stride] = seen[..., first : first + 3]
+            engine.add_cotangents(bar, numbers[t + 1], whole.reshape(-1), first)
         if engine.manipulators:
             engine.add_pose_cotangents(_flat(posed))
 
-    def react_at(self, t: int) -> tuple[Any, Any] | None:
-        """Return the derivatives with respect to the observation before step t from the adjoint of its
-        actions, or those of the last observation."""
-        if t == self._steps:
-            return self._react(t, None)
-        shape = self._engine.batch, self._engine.actions_per_step
-        bar = numbers_of(self.actions_bar, shape, self._like, first=t * self._row)
-        if self._drives:
-            # Steps are processed from the last to the first, because later steps depend on the joints of
-            # earlier ones.
-            by_actions, self._joints_bar = self._drives[t].pull_back(bar[None], self._joints_bar)
-            bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
-        return self._react(t, bar)
-
-    def _zeros(self, like: Any) -> Any:
-        shape = self._engine.batch, self._engine.particles, 3
-        return like.new_zeros(shape) if on_device(like) else np.zeros(shape, like.dtype)
+    simulator._version += 1
+    # Contact before these steps does not depend on their actions.
+    engine.write(engine.touched, np.zeros(engine.batch))
+    plan = tape.plan(steps, simulator.memory_mb)
+    terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
+    observe(0, particles.current, 0)
+    tape.forward(actions, poses, None, steps, plan, after=lambda t, state, slot: observe(t + 1, state, slot))
+    require_none(broken_states(engine.read(engine.fault), engine.substeps))
+    before = simulator.steps_before_contact(steps)
+    with simulator._kept_weights() as weights:
+        tape.backward(actions, poses, terms, steps, before, add, actions_bar)
+    bars = numbers_of(actions_bar, (steps, engine.batch, engine.actions_per_step), like)
+    require_none(broken_gradients(bars.swapaxes(0, 1)))
+    react_at(0)
+    engine.place(poses, steps, simulator._pose, 0)
+    values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), like)
+    return simulator._judged(values).terms[1:].swapaxes(0, 1)
 
 
 def _flat(array: Any) -> Any:
-    return array.reshape(-1).contiguous() if on_device(array) else np.ascontiguousarray(array).reshape(-1)
+    if on_device(array):
+        return array.detach().reshape(-1).contiguous()
+    return np.ascontiguousarray(array).reshape(-1)

@@ -120,15 +120,21 @@ def kernel_actions(
     numbers = _numbers(actions, (batch, None, components) if rollout else (batch, components))
     if through is not None:
         numbers = through(numbers.reshape(-1, batch, components)).reshape(-1)
-    stays = on_device(numbers) and engine.cuda and numbers.shape[0] > 0
+    count = numbers.shape[0]
+    if on_device(numbers) and not (engine.cuda and count):
+        numbers = numbers.cpu().numpy()
+    stays = on_device(numbers)
     if stays and not rollout and _in_default_stream():
         return numbers
+    if not (rollout or stays):
+        # Copy, because Taichi assumes that kernels may write to arrays.
+        return np.append(numbers, np.zeros(0 if count else 1))
     # Another stream might reuse a tensor's memory before the kernels have read it.
-    if rollout or stays:
-        return _array_of(numbers, engine.cuda)
-    # Copy, because Taichi assumes that kernels may write to arrays.
-    array = np.zeros(max(1, numbers.shape[0]))
-    array[: numbers.shape[0]] = numbers.cpu() if on_device(numbers) else numbers
+    array = ti.ndarray(ti.f64, shape=max(1, count))
+    if count:
+        copy_numbers(array, 0, numbers, count, 1)
+    if stays and not _in_default_stream():
+        ti.sync()
     return array
 
 
@@ -160,20 +166,6 @@ def _numbers(
     if not finite:
         raise ArgumentError("actions contain NaN or infinity")
     return flat
-
-
-def _array_of(numbers: "np.ndarray | torch.Tensor", cuda: bool) -> ti.Ndarray:
-    array = ti.ndarray(ti.f64, shape=max(1, numbers.shape[0]))
-    if not numbers.shape[0]:
-        return array
-    if on_device(numbers) and cuda:
-        copy_numbers(array, 0, numbers, numbers.shape[0], 1)
-        if not _in_default_stream():
-            ti.sync()
-    else:
-        held = numbers.cpu().numpy() if on_device(numbers) else numbers
-        copy_numbers(array, 0, held, numbers.shape[0], 1)
-    return array
 
 
 def _in_default_stream() -> bool:
