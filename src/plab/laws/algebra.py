@@ -60,9 +60,9 @@ def det_sym(s):
     )
 
 
-def cofactor_sym(s):
-    """Cofactor matrix of a symmetric matrix: det(S) S^-1, symmetric."""
-    return (
+def inverse_sym(s):
+    """Inverse of a symmetric matrix."""
+    c = (
         s[1] * s[2] - s[5] * s[5],
         s[0] * s[2] - s[4] * s[4],
         s[0] * s[1] - s[3] * s[3],
@@ -70,13 +70,8 @@ def cofactor_sym(s):
         s[3] * s[5] - s[4] * s[1],
         s[3] * s[4] - s[5] * s[0],
     )
-
-
-def inverse_sym(s):
-    """Inverse of a symmetric matrix."""
-    c = cofactor_sym(s)
     r = 1.0 / (s[0] * c[0] + s[3] * c[3] + s[4] * c[4])
-    return (r * c[0], r * c[1], r * c[2], r * c[3], r * c[4], r * c[5])
+    return tuple(r * x for x in c)
 
 
 def outer_sym(a):
@@ -155,47 +150,24 @@ def inverse_cbrt(j, steps):
     return c
 
 
-def log_horner(i1, i2, i3, terms):
-    """Horner states of the atanh series: coefficients of (I, Z, Z^2) after each of ``terms`` steps, lowest
-    order first.
-
-    Entry 3 k + c of the returned list is coefficient c of sum over j >= k of Z^(2 (j - k)) / (2 j + 1).
-    """
+def log_coefficients(i1, i2, i3, terms):
+    """Coefficients a1, a2 of Z and Z^2 in atanh(Z) by Horner's rule; that of I drops out of the deviator."""
     n13 = i1 * i3
     n23 = i3 - i1 * i2
     n33 = i1 * i1 - i2
-    states = [0.0 * i1 for _ in range(3 * terms)]
-    states[3 * terms - 3] = 0.0 * i1 + 1.0 / (2 * terms - 1)
-    for r in range(terms - 1):
-        k = 3 * (terms - 2 - r)
-        states[k] = i3 * states[k + 4] + n13 * states[k + 5] + 1.0 / (2 * (terms - 2 - r) + 1)
-        states[k + 1] = n23 * states[k + 5] - i2 * states[k + 4]
-        states[k + 2] = states[k + 3] + i1 * states[k + 4] + n33 * states[k + 5]
-    return states
-
-
-def log_coefficients(i1, i2, i3, terms):
-    """Coefficients a1, a2 of Z and Z^2 in atanh(Z); that of I drops out of the deviator."""
-    h = log_horner(i1, i2, i3, terms)
-    return h[0] - i2 * h[2], h[1] + i1 * h[2]
-
-
-def exp_horner(q, det_d, terms):
-    """Horner states of the exponential series of a traceless d with q = tr(d^2) / 2, lowest order first.
-
-    Entry 3 k + c of the returned list is coefficient c, of (I, d, d^2), of sum over j >= k of d^(j - k) / j!.
-    """
-    states = [0.0 * q for _ in range(3 * terms)]
-    states[3 * terms - 3] = 0.0 * q + 1.0 / math.factorial(terms - 1)
-    for r in range(terms - 1):
-        k = 3 * (terms - 2 - r)
-        states[k] = det_d * states[k + 5] + 1.0 / math.factorial(terms - 2 - r)
-        states[k + 1] = states[k + 3] + q * states[k + 5]
-        states[k + 2] = states[k + 4]
-    return states
+    h0, h1, h2 = 0.0 * i1 + 1.0 / (2 * terms - 1), 0.0 * i1, 0.0 * i1
+    for k in reversed(range(terms - 1)):
+        h0, h1, h2 = (
+            i3 * h1 + n13 * h2 + 1.0 / (2 * k + 1),
+            n23 * h2 - i2 * h1,
+            h0 + i1 * h1 + n33 * h2,
+        )
+    return h0 - i2 * h2, h1 + i1 * h2
 
 
 def exp_coefficients(q, det_d, terms):
-    """Coefficients of I, d, d^2 in exp(d) for a traceless d with q = tr(d^2) / 2."""
-    h = exp_horner(q, det_d, terms)
-    return h[0], h[1], h[2]
+    """Coefficients of I, d, d^2 in exp(d) for a traceless d with q = tr(d^2) / 2, by Horner's rule."""
+    h0, h1, h2 = 0.0 * q + 1.0 / math.factorial(terms - 1), 0.0 * q, 0.0 * q
+    for k in reversed(range(terms - 1)):
+        h0, h1, h2 = det_d * h2 + 1.0 / math.factorial(k), h0 + q * h2, h1
+    return h0, h1, h2

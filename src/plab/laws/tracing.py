@@ -75,9 +75,9 @@ class Node:
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
         """Record a NumPy function of numbers, or an operator with a NumPy number on the left."""
-        if function in _OPERATORS:
+        if function in OPERATORS:
             left, right = given
-            return _OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
+            return OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
         return self.trace.node(_FUNCTIONS[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _keywords: Any) -> Number:
@@ -86,20 +86,15 @@ class Node:
         return self.trace.node("where", *given)
 
 
-_FUNCTIONS = {
-    np.sqrt: "sqrt",
-    np.minimum: "minimum",
-    np.maximum: "maximum",
-    np.exp: "exp",
-    np.log: "log",
-}
+_FUNCTIONS = {getattr(np, name): name for name in ("sqrt", "minimum", "maximum", "exp", "log")}
 
-_OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
+OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
     np.add: operator.add,
     np.subtract: operator.sub,
     np.multiply: operator.mul,
     np.divide: operator.truediv,
 }
+"""Operators that NumPy's numbers call as functions."""
 
 
 def frozen(number: Number) -> Number:
@@ -237,13 +232,9 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "div": operator.truediv,
     "neg": operator.neg,
     "less": operator.lt,
-    "sqrt": np.sqrt,
-    "minimum": np.minimum,
-    "maximum": np.maximum,
-    "exp": np.exp,
-    "log": np.log,
     "frozen": lambda number: number,
     "where": np.where,
+    **{name: function for function, name in _FUNCTIONS.items()},
 }
 
 

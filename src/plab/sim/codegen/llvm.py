@@ -7,7 +7,6 @@ may be fused, which Taichi does not allow on CPUs.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import reduce
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
+from plab.laws.tracing import OPERATORS
 from plab.sim.storage import LANES
 
 LANE = LANES["cpu"]
@@ -364,7 +364,8 @@ class Number:
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number | float) -> Any:
         """NumPy's functions of numbers."""
-        return _UFUNCS[function](*given) if function in _UFUNCS else self._operation(_NAMES[function], *given)
+        own = OPERATORS.get(function)
+        return own(*given) if own else self._operation(_NAMES[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Number:
         """:func:`numpy.where`; other NumPy functions of arrays are not supported."""
@@ -374,14 +375,6 @@ class Number:
 
 _NAMES = {np.sqrt: "root", np.minimum: "least", np.maximum: "most", np.exp: "exp", np.log: "log"}
 """Methods of :class:`Code` for NumPy's functions."""
-
-_UFUNCS = {
-    np.add: operator.add,
-    np.subtract: operator.sub,
-    np.multiply: operator.mul,
-    np.divide: operator.truediv,
-}
-"""Operators that NumPy's numbers call as functions."""
 
 
 def _equals(other: Number | float, number: float) -> bool:
