@@ -157,11 +157,7 @@ def log_coefficients(i1, i2, i3, terms):
     n33 = i1 * i1 - i2
     h0, h1, h2 = 0.0 * i1 + 1.0 / (2 * terms - 1), 0.0 * i1, 0.0 * i1
     for k in reversed(range(terms - 1)):
-        h0, h1, h2 = (
-            i3 * h1 + n13 * h2 + 1.0 / (2 * k + 1),
-            n23 * h2 - i2 * h1,
-            h0 + i1 * h1 + n33 * h2,
-        )
+        h0, h1, h2 = (i3 * h1 + n13 * h2 + 1.0 / (2 * k + 1), n23 * h2 - i2 * h1, h0 + i1 * h1 + n33 * h2)
     return h0 - i2 * h2, h1 + i1 * h2
 
 

@@ -7,12 +7,4 @@ from plab.sim.simulator import Simulator
 from plab.sim.state import Measures, Rollout, State
 from plab.sim.tape import RecordedStates
 
-__all__ = [
-    "DeviceError",
-    "Measures",
-    "RecordedStates",
-    "Rollout",
-    "SimulationError",
-    "Simulator",
-    "State",
-]
+__all__ = ["DeviceError", "Measures", "RecordedStates", "Rollout", "SimulationError", "Simulator", "State"]

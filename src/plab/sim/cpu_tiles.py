@@ -279,17 +279,7 @@ class TilePhases(ParticlePhases):
                     self.law_tile(state_at, source, target, entry9, e, at, number, update)
 
     @ti.func
-    def law_tile(
-        self,
-        state_at,
-        source,
-        target,
-        entry9,
-        e,
-        at,
-        number: ti.template(),
-        update: ti.template(),
-    ):
+    def law_tile(self, state_at, source, target, entry9, e, at, number: ti.template(), update: ti.template()):
         self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
         first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
         affine = self.lane_in(self.affine, entry9, 0)

@@ -5,14 +5,7 @@ import math
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
-from plab.sim.storage import (
-    AT_FRAME_GAP,
-    AT_FRAME_ROTATION,
-    AT_FRAME_SPIN,
-    AT_FRAME_VELOCITY,
-    BLOCK,
-    Storage,
-)
+from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, BLOCK, Storage
 from plab.sim.tensors import Array
 
 MASS_MIN = 1e-12

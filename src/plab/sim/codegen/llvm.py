@@ -35,14 +35,7 @@ class Code:
     """
 
     def __init__(
-        self,
-        module: ir.Module,
-        name: str,
-        real: ir.Type,
-        addresses: str,
-        numbers: str,
-        *,
-        grid: bool = True,
+        self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str, *, grid: bool = True
     ) -> None:
         """Begin a function with named arguments: addresses, optionally a grid's nodes per axis, and
         numbers."""

@@ -385,13 +385,7 @@ class Particle:
     """Numbers of a particle, read from and written to local variables of the caller."""
 
     def __init__(
-        self,
-        module: ir.Module,
-        name: str,
-        real: ir.Type,
-        vectors: str,
-        numbers: str = "",
-        grids: str = "",
+        self, module: ir.Module, name: str, real: ir.Type, vectors: str, numbers: str = "", grids: str = ""
     ) -> None:
         """Begin a function of grid addresses and nodes per axis, vectors (named with their lengths, such as
         ``c9``), and numbers."""
