@@ -25,14 +25,12 @@ SHARED = (
 """Properties that must agree between the scenes of a simulator, besides the shapes of manipulators."""
 
 
-def scene_kind(scene: Scene) -> tuple[Any, ...]:
-    """Return a key that is equal for scenes that can share a simulator, in sequence or in a batch."""
-    shared = (getattr(scene, name) for name in SHARED)
-    return (*shared, *(tool.shape for tool in scene.manipulators), _topology(scene))
-
-
-def _topology(scene: Scene) -> tuple[Any, ...]:
-    return scene.kinematics.topology if scene.kinematics else ()
+def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
+    """Return a key that is equal for scenes that can share a simulator, in sequence or in a batch: names of
+    properties and their values."""
+    shared = ((name, getattr(scene, name)) for name in SHARED)
+    topology = scene.kinematics.topology if scene.kinematics else ()
+    return (*shared, ("manipulators", (*(tool.shape for tool in scene.manipulators), topology)))
 
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
@@ -47,31 +45,23 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
         if not isinstance(scene, Scene):
             raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
         scene.validate()
-        for name in SHARED:
-            if getattr(scene, name) != getattr(first, name):
+        for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
+            if own != other:
                 raise SceneError(
-                    f"scenes of one batch need the same {name}: {of} has {getattr(first, name)}, "
-                    f"scene {number} has {getattr(scene, name)}"
+                    f"scenes of one batch need the same {name}; scene {number} differs from {of}"
                 )
-        shapes = [[m.shape for m in one.manipulators] for one in (scene, first)]
-        if shapes[0] != shapes[1] or _topology(scene) != _topology(first):
-            raise SceneError(
-                f"scenes of one batch need the same manipulators; scene {number} differs from {of}"
-            )
 
 
 def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
     """Return the initial poses of the manipulators, shape [batch, manipulator, 8]; see
     :class:`plab.sim.State`."""
-    turn = list if scenes[0].digits_convention == "release" else _unit
-    return np.array(
-        [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes], dtype=np.float64
-    ).reshape(len(scenes), len(scenes[0].manipulators), 8)
-
-
-def _unit(rotation: Sequence[float]) -> list[float]:
-    q = np.asarray(rotation, float)
-    return list(q / np.linalg.norm(q))
+    as_given = scenes[0].digits_convention == "release"
+    poses = []
+    for tool in (tool for scene in scenes for tool in scene.manipulators):
+        rotation = np.asarray(tool.rotation, float)
+        unit = rotation if as_given else rotation / np.linalg.norm(rotation)
+        poses.append([*tool.position, *unit, tool.gap])
+    return np.array(poses, np.float64).reshape(len(scenes), len(scenes[0].manipulators), 8)
 
 
 def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "particles") -> np.ndarray:

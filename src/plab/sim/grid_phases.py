@@ -220,17 +220,10 @@ class GridPhases(Storage):
     # -- walls --------------------------------------------------------------------------------------
 
     @ti.func
-    def wall_free(self, i, v, axis: ti.template()):
-        """Velocity after the frictionless walls of one axis."""
-        out = v
-        node = i[axis] - 1
-        if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
-            out[axis] = 0.0
-        return out
-
-    @ti.func
-    def wall_free_adjoint(self, i, v, bar, axis: ti.template()):
-        out = bar
+    def wall_free(self, i, v, value, axis: ti.template()):
+        """A velocity or adjoint at a node, without its component along an axis where the velocity ``v`` leads
+        into one of the frictionless walls."""
+        out = value
         node = i[axis] - 1
         if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
             out[axis] = 0.0
@@ -264,26 +257,26 @@ class GridPhases(Storage):
     @ti.func
     def walls(self, i, v, friction):
         """Velocity of a node after walls and floor, axis by axis."""
-        v1 = self.wall_free(i, v, 0)
+        v1 = self.wall_free(i, v, v, 0)
         if self.has_floor_friction(i, v1, friction):
             v1 = self.floor(v1, friction)
         else:
-            v1 = self.wall_free(i, v1, 1)
-        return self.wall_free(i, v1, 2)
+            v1 = self.wall_free(i, v1, v1, 1)
+        return self.wall_free(i, v1, v1, 2)
 
     @ti.func
     def walls_adjoint(self, i, v, friction, bar):
-        v1 = self.wall_free(i, v, 0)
+        v1 = self.wall_free(i, v, v, 0)
         v2 = v1
         floored = self.has_floor_friction(i, v1, friction)
         if floored:
             v2 = self.floor(v1, friction)
-        out = self.wall_free_adjoint(i, v2, bar, 2)
+        out = self.wall_free(i, v2, bar, 2)
         if floored:
             out = self.floor_adjoint(v1, friction, out)
         else:
-            out = self.wall_free_adjoint(i, v1, out, 1)
-        return self.wall_free_adjoint(i, v, out, 0)
+            out = self.wall_free(i, v1, out, 1)
+        return self.wall_free(i, v, out, 0)
 
     # -- one node -----------------------------------------------------------------------------------
 

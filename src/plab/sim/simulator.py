@@ -33,7 +33,6 @@ from plab.sim.state import (
     broken_states,
     broken_terms,
     require_none,
-    rest_state,
 )
 from plab.sim.tape import RecordedStates, Tape, closed_loop, record
 from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
@@ -317,7 +316,7 @@ class Simulator:
         self._particles.order.reset()
         self._joints = self._initial_joints
         self._place(self._initial_poses)
-        self._clear_impulses()
+        self._take_impulses(clear=True)
         self._checked = True
 
     def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
@@ -445,13 +444,11 @@ class Simulator:
             raise RuntimeError("build the simulator with impulses=True")
         return numbers_of(self._impulses, (self.batch, self.manipulator_count, 3), like)
 
-    def _take_impulses(self) -> None:
+    def _take_impulses(self, clear: bool = False) -> None:
         if self._impulses is not None:
             self._engine.take_impulses(self._impulses)
-
-    def _clear_impulses(self) -> None:
-        if self._impulses is not None:
-            self._impulses.fill(0.0)
+            if clear:
+                self._impulses.fill(0.0)
 
     def set_state(self, state: State) -> None:
         """Replace the current state.
@@ -463,23 +460,20 @@ class Simulator:
             ValueError: If a shape is wrong.
         """
         self._require_runtime()
-        expected = (self.batch, self.particle_count)
-        for name, tail in (("x", (3,)), ("v", (3,)), ("C", (3, 3)), ("F", (3, 3))):
-            if np.shape(getattr(state, name)) != (*expected, *tail):
-                raise ArgumentError(
-                    f"{name} has shape {np.shape(getattr(state, name))}, not {(*expected, *tail)}"
-                )
-        if np.shape(state.poses) != self._initial_poses.shape:
-            raise ArgumentError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
-        shapes = [np.shape(() if one is None else one) for one in (state.joints, self._initial_joints)]
-        if shapes[0] != shapes[1]:
-            raise ArgumentError(f"joints have shape {shapes[0]}, not {shapes[1]}")
+        tails = {"x": (3,), "v": (3,), "C": (3, 3), "F": (3, 3)}
+        expected = {name: (self.batch, self.particle_count, *tail) for name, tail in tails.items()}
+        joints = () if self._initial_joints is None else self._initial_joints
+        expected |= {"poses": self._initial_poses.shape, "joints": np.shape(joints)}
+        for name, shape in expected.items():
+            value = getattr(state, name)
+            if np.shape(() if value is None else value) != shape:
+                raise ArgumentError(f"{name} has shape {np.shape(value)}, not {shape}")
         self._checked_particles(state.x)
         self._version += 1
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()
         self._joints = None if state.joints is None else np.array(state.joints, np.float64)
-        self._clear_impulses()
+        self._take_impulses(clear=True)
         self._place(np.asarray(state.poses, np.float64))
 
     def initial_state(self) -> State:
@@ -727,7 +721,9 @@ class Simulator:
         self._particles.order.start_from(positions)
         self._engine.fill_bodies(self.scenes, self._particles.order.initial)
         self._start_manipulators()
-        start = rest_state(np.stack(positions), self._initial_poses)
+        x = np.stack(positions)
+        identity = np.broadcast_to(np.eye(3), (*x.shape, 3))
+        start = State(x, np.zeros_like(x), np.zeros((*x.shape, 3)), identity, self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))
 
     def _start_manipulators(self) -> None:

@@ -75,14 +75,6 @@ class Rollout:
     failures: dict[int, str] = field(default_factory=dict)
 
 
-def rest_state(x: np.ndarray, poses: np.ndarray) -> State:
-    """Return particles at rest and without strain, at positions of shape [batch, particle, 3]; poses as in
-    :class:`State`."""
-    shape = (*x.shape, 3)
-    identity = np.broadcast_to(np.eye(3), shape)
-    return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)
-
-
 # -- diverged environments --------------------------------------------------------------------------
 
 
@@ -104,7 +96,7 @@ def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int =
 
 def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
     """Return the environments with non-finite measures, shape [T + 1, batch, 6], and the step of each."""
-    broken = ~_all_finite(values)
+    broken = _is_broken(values)
     first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
     when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
     return {e: f"{text}: the loss is not finite" for e, text in when.items()}
@@ -113,13 +105,14 @@ def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
 def broken_gradients(gradient: np.ndarray | torch.Tensor) -> dict[int, str]:
     """Return the environments with non-finite gradients, shape [batch, T, action], and the last such step of
     each."""
-    broken = ~_all_finite(gradient)
-    last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
-    return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
+    steps, environments = np.nonzero(_is_broken(gradient).T)
+    last = dict(zip(environments.tolist(), steps.tolist(), strict=True))
+    return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in sorted(last.items())}
 
 
-def _all_finite(values: np.ndarray | torch.Tensor) -> np.ndarray:
-    return values.isfinite().all(2).cpu().numpy() if on_device(values) else np.isfinite(values).all(2)
+def _is_broken(values: np.ndarray | torch.Tensor) -> np.ndarray:
+    finite = values.isfinite().all(2).cpu().numpy() if on_device(values) else np.isfinite(values).all(2)
+    return ~finite
 
 
 def require_none(failures: Mapping[int, str]) -> None:
