@@ -215,12 +215,12 @@ def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.
         sim.set_initial_state(State(**fields, poses=sim.poses()))
         sim.rollout(np.zeros((sim.batch, 1, 0)))
         state = sim.state()
-        order = sim._particles.order.current()
+        order = sim._particles.order()
         sim.set_initial_state(State(**at_rest(), poses=sim.poses()))
     else:
         put(sim, fields)
         state = advance(sim, 1)
-        order = sim._particles.order.current()
+        order = sim._particles.order()
     engine = sim._engine
     # With C = 0 particles hand the stress alone to the grid.
     tiles = engine.affine.to_numpy().reshape(sim.batch, engine.tiles, 9, engine.lanes)

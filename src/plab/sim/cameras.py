@@ -99,7 +99,7 @@ class CameraSensor:
         self._trace(self._frame, self._keys, camera.focal_length, camera.near, camera.far)
         self._splat(
             particles.current,
-            particles.order.numbers,
+            particles.numbers,
             self._frame,
             self._balls,
             self._labels,

@@ -76,119 +76,98 @@ def curve_order(x: np.ndarray, n: int) -> np.ndarray:
     return np.argsort(hilbert_index(cell, int(PARTS * (n + 1)).bit_length()), kind="stable")
 
 
-class ParticleOrder:
-    """Particle numbers by place in the tiles.
+class Particles:
+    """Current state of all particles, their order, and steps of the state.
 
     Attributes:
-        initial: The order after :meth:`reset`, shape [batch, particle].
-        numbers: Particle numbers on the device, by place, shape [batch * place]; numbers at or above the
-            number of particles are padding.
+        engine: The kernels.
+        current: Tiles of the current state.
+        numbers: Particle numbers on the device, by place in the tiles, shape [batch * place]; numbers at or
+            above the number of particles are padding.
+        initial: The order after :meth:`reset_order`: particle numbers by place, shape [batch, particle].
+        places: Places in all environments, padding included.
     """
 
-    def __init__(self, engine: Any) -> None:
-        """Allocate; call :meth:`start_from` next. ``engine`` has the kernels of the CPU or CUDA."""
-        self._engine = engine
-        self.numbers = self.allocate(1)
+    def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
+        """Allocate; call :meth:`start_order` next. ``numpy_real`` is NumPy's type of numbers."""
+        self.engine: Any = engine
+        self.places = engine.batch * engine.tiles * engine.lanes
+        self.current = self.array(1)
+        self.numbers = self.order_array(1)
         if engine.sorts:
-            engine.allocate_order()
-            self._spare = self.allocate(1)
-            self._moves = self.allocate(1)
+            self.engine.allocate_order()
+            # Destinations of state and order when particles are sorted.
+            self._spare, self._spare_numbers = self.array(1), self.order_array(1)
+            self._moves = self.order_array(1)
+        self._numpy_real = numpy_real
+        self._stamp = 0
 
-    def start_from(self, positions: Sequence[np.ndarray]) -> None:
+    def array(self, slots: int) -> ti.Ndarray:
+        return ti.ndarray(self.engine.lane_type, shape=slots * self.places // self.engine.lanes * STATE)
+
+    def order_array(self, steps: int) -> ti.Ndarray:
+        return ti.ndarray(ti.i32, shape=steps * self.places)
+
+    @property
+    def slot_entries(self) -> int:
+        """Number of entries in one state of all environments."""
+        return self.places * STATE
+
+    @property
+    def slot_bytes(self) -> int:
+        """Size of one state of all environments [bytes]."""
+        return self.slot_entries * np.dtype(self._numpy_real).itemsize
+
+    # -- order --------------------------------------------------------------------------------------
+
+    def start_order(self, positions: Sequence[np.ndarray]) -> None:
         """Set the initial order from the positions of each environment [domain units], [particle, 3]."""
-        engine = self._engine
+        engine = self.engine
         self.initial = np.stack([curve_order(x, engine.n) for x in positions])
         batch, particles = self.initial.shape
         padding = np.arange(particles, engine.tiles * engine.lanes)
         rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)
         self._start = rows.astype(np.int32).reshape(-1)
         self._changed = True
-        self.reset()
+        self.reset_order()
 
-    @property
-    def places(self) -> int:
-        """Places in all environments, padding included."""
-        return self._engine.batch * self._engine.tiles * self._engine.lanes
-
-    def allocate(self, steps: int) -> ti.Ndarray:
-        return ti.ndarray(ti.i32, shape=steps * self.places)
-
-    def reset(self, environments: Sequence[int] | None = None) -> None:
+    def reset_order(self, environments: Sequence[int] | None = None) -> None:
         """Return to the initial order, of all environments or of some."""
         if self._changed and environments is None:
             copy_numbers(self.numbers, 0, self._start, self.places, 1)
             self._changed = False
         if self._changed:
-            own = self.places // self._engine.batch
+            own = self.places // self.engine.batch
             for e in environments or ():
                 first = int(e) * own
                 copy_numbers(self.numbers, first, self._start[first : first + own], own, 1)
 
-    def current(self) -> np.ndarray:
-        """The order at present, shape [batch, particle]."""
-        batch, particles = self.initial.shape
+    def order(self) -> np.ndarray:
+        """Return the order at present, shape [batch, particle]."""
         out = np.zeros(self.places, np.int32)
         copy_numbers(self.numbers, 0, out, self.places, 0)
-        return out.reshape(batch, -1)[:, :particles].astype(np.int64)
+        return out.reshape(self.engine.batch, -1)[:, : self.engine.particles].astype(np.int64)
 
-    def noted(self) -> ti.Ndarray:
+    def noted_order(self) -> ti.Ndarray:
         """Return a snapshot of :attr:`numbers`."""
-        if not self._engine.sorts:
+        if not self.engine.sorts:
             return self.numbers
-        copy = self.allocate(1)
+        copy = self.order_array(1)
         copy_numbers(copy, 0, self.numbers, self.places, 1)
         return copy
 
     def sort(
-        self,
-        state: ti.Ndarray,
-        slot: int,
-        target: ti.Ndarray,
-        target_slot: int,
-        t: int,
-        stamp: int,
-        moves: ti.Ndarray | None = None,
+        self, state: ti.Ndarray, slot: int, to: ti.Ndarray, to_slot: int, t: int, moves: ti.Ndarray | None
     ) -> None:
         """Sort a state by cell into another array or time slot, and make this the current order; ``moves``,
-        by default the order's own for step 0, is written for step t."""
-        moves = self._moves if moves is None else moves
-        self._engine.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
-        self.numbers, self._spare = self._spare, self.numbers
+        by default an own array for step 0, is written for step t."""
+        t, moves = (0, self._moves) if moves is None else (t, moves)
+        stamp, after = self.new_stamps(1), self._spare_numbers
+        self.engine.sort(state, slot, to, to_slot, self.numbers, after, moves, t, stamp)
+        self.numbers, self._spare_numbers = after, self.numbers
         self._changed = True
 
-
-class Particles:
-    """Current state of all particles, and steps of it.
-
-    Attributes:
-        engine: The kernels.
-        current: Tiles of the current state, in the order ``order``.
-        order: Particle order.
-    """
-
-    def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
-        """Allocate; neither state nor order is set. ``numpy_real`` is NumPy's type of numbers."""
-        self.engine = engine
-        self.order = ParticleOrder(engine)
-        self.current = self.array(1)
-        # Destination of the current state when its particles are sorted.
-        self._spare = self.array(1) if engine.sorts else None
-        self._numpy_real = numpy_real
-        self._stamp = 0
-
-    def array(self, slots: int) -> ti.Ndarray:
-        engine = self.engine
-        return ti.ndarray(engine.lane_type, shape=slots * engine.batch * engine.tiles * STATE)
-
-    @property
-    def slot_entries(self) -> int:
-        """Number of entries in one state of all environments."""
-        return self.engine.batch * self.engine.tiles * STATE * self.engine.lanes
-
-    @property
-    def slot_bytes(self) -> int:
-        """Size of one state of all environments [bytes]."""
-        return self.slot_entries * np.dtype(self._numpy_real).itemsize
+    # -- steps --------------------------------------------------------------------------------------
 
     def new_stamps(self, count: int) -> int:
         """Return the first of ``count`` new stamps, which distinguish the marks of one scatter from earlier
@@ -200,8 +179,6 @@ class Particles:
         first = self._stamp + 1
         self._stamp += count
         return first
-
-    # -- steps --------------------------------------------------------------------------------------
 
     def step(
         self,
@@ -215,8 +192,7 @@ class Particles:
         """Advance the current state by environment step t, in place, from one entry of the pose history to
         another; ``moves`` stores the particle order of the step if it is needed later."""
         if self.engine.sorts:
-            entry = 0 if moves is None else t
-            self.order.sort(self.current, 0, self._spare, 0, entry, self.new_stamps(1), moves)
+            self.sort(self.current, 0, self._spare, 0, t, moves)
             self.current, self._spare = self._spare, self.current
         self.advance(self.current, 0, 0, poses, actions, t, entries)
 
@@ -250,7 +226,7 @@ class Particles:
         flat[:, :, [AT_F, AT_F + 4, AT_F + 8]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self.order.initial[:, :, None], axis=1)
+        flat[:, :n] = np.take_along_axis(values, self.initial[:, :, None], axis=1)
         tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
@@ -259,7 +235,7 @@ class Particles:
         by default the current order."""
         engine = self.engine
         b, n = engine.batch, engine.particles
-        order = self.order.current() if order is None else order
+        order = self.order() if order is None else order
         rows = tiles.reshape(b, engine.tiles, STATE, engine.lanes).transpose(0, 1, 3, 2)
         flat = rows.reshape(b, -1, STATE)[:, :n]
         values = np.empty((b, n, STATE))

@@ -151,7 +151,7 @@ class Simulator:
         """Memory of all fields and arrays of the simulator on its device [bytes], without Taichi itself,
         compiled kernels and transfers to or from the host."""
         engine = self._engine
-        return held_bytes(self, engine, *engine.terms, self._particles, self._particles.order, self._tape)
+        return held_bytes(self, engine, *engine.terms, self._particles, self._tape)
 
     # -- settings -----------------------------------------------------------------------------------
 
@@ -287,7 +287,7 @@ class Simulator:
         self._engine.fill_parameters(scenes)
         self._start_manipulators()
         for e, x in held.items():
-            order = self._particles.order.initial[e].astype(np.int32)
+            order = self._particles.initial[e].astype(np.int32)
             self._engine.place_at_rest(self._initial, e, order, x.reshape(-1))
 
     # -- forward ------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ class Simulator:
                 kept = np.array(self.impulses()) * (chosen == 0)[:, None, None]
                 copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, 1)
             self._engine.copy_chosen(self._initial, self._particles.current, chosen)
-            self._particles.order.reset(environments)
+            self._particles.reset_order(environments)
             poses = np.array(self.poses())
             poses[chosen != 0] = self._initial_poses[chosen != 0]
             if self._initial_joints is not None:
@@ -313,7 +313,7 @@ class Simulator:
             self._place(poses)
             return
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
-        self._particles.order.reset()
+        self._particles.reset_order()
         self._joints = self._initial_joints
         self._place(self._initial_poses)
         self._take_impulses(clear=True)
@@ -410,7 +410,7 @@ class Simulator:
         size = self.batch * count * 6
 
         def fill(out: ti.Ndarray | torch.Tensor) -> None:
-            self._engine.observe(state, slot, self._particles.order.numbers, stride, out)
+            self._engine.observe(state, slot, self._particles.numbers, stride, out)
 
         if on_device(like):
             return output_for(fill, size, self.precision == "float64", like).reshape(self.batch, count, 6)
@@ -471,7 +471,7 @@ class Simulator:
         self._checked_particles(state.x)
         self._version += 1
         self._particles.current.from_numpy(self._particles.pack(state))
-        self._particles.order.reset()
+        self._particles.reset_order()
         self._joints = None if state.joints is None else np.array(state.joints, np.float64)
         self._take_impulses(clear=True)
         self._place(np.asarray(state.poses, np.float64))
@@ -479,7 +479,7 @@ class Simulator:
     def initial_state(self) -> State:
         """Return the initial state of :meth:`reset` and :meth:`rollout`."""
         self._require_runtime()
-        order = self._particles.order.initial
+        order = self._particles.initial
         state = self._particles.unpack(self._initial.to_numpy(), self._initial_poses.copy(), order)
         return replace(state, joints=self._initial_joints)
 
@@ -616,7 +616,7 @@ class Simulator:
         """
         self._require_gradient()
         assert self._tape.bar is not None
-        return self._adjoint(self._tape.bar, self._particles.order.initial)
+        return self._adjoint(self._tape.bar, self._particles.initial)
 
     def material_gradient(self) -> np.ndarray:
         """Return the gradient of the last :meth:`rollout`'s loss with respect to the material.
@@ -718,8 +718,8 @@ class Simulator:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
         given = map(sample_particles, self.scenes) if particles is None else particles
         positions = [self._checked_particles(x) for x in given]
-        self._particles.order.start_from(positions)
-        self._engine.fill_bodies(self.scenes, self._particles.order.initial)
+        self._particles.start_order(positions)
+        self._engine.fill_bodies(self.scenes, self._particles.initial)
         self._start_manipulators()
         x = np.stack(positions)
         identity = np.broadcast_to(np.eye(3), (*x.shape, 3))

@@ -79,10 +79,10 @@ class Tape:
         engine, particles, reach = self._engine, self._particles, self._reach_max
         engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
-        held = held_bytes(engine, *engine.terms, particles, particles.order) + particles.slot_bytes
+        held = held_bytes(engine, *engine.terms, particles) + particles.slot_bytes
         if engine.sorts:
             # The orders of all steps, and the adjoint's other half.
-            held += 4 * steps * particles.order.places + particles.slot_bytes
+            held += 4 * steps * particles.places + particles.slot_bytes
         segments_max = ENTRIES_MAX[engine.device] // particles.slot_entries
         lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
         if not lengths:
@@ -115,9 +115,9 @@ class Tape:
             self._checkpoints = None
             self._checkpoints = self._particles.array(segments)
         if self._engine.sorts and (
-            self._moves is None or self._moves.shape[0] < steps * self._particles.order.places
+            self._moves is None or self._moves.shape[0] < steps * self._particles.places
         ):
-            self._moves = self._particles.order.allocate(steps)
+            self._moves = self._particles.order_array(steps)
         if self.bar is None:
             self.bar = self._particles.array(1)
             self._spare_bar = self._particles.array(1) if self._engine.sorts else None
@@ -183,8 +183,7 @@ class Tape:
             if known:
                 self._engine.move(history, slot - 1, history, slot, self._moves, t)
             else:
-                stamp = self._particles.new_stamps(1)
-                self._particles.order.sort(history, slot - 1, history, slot, t, stamp, self._moves)
+                self._particles.sort(history, slot - 1, history, slot, t, self._moves)
         self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1))
 
     def _entry(self, t: int) -> int:
@@ -323,7 +322,7 @@ def record(
     def note(t: int, state: ti.Ndarray, slot: int) -> None:
         if t < first:
             return
-        numbers.append(particles.order.noted())
+        numbers.append(particles.noted_order())
         size = engine.batch * engine.particles * 6
         rows.append(filled(size, lambda out: engine.observe(state, slot, numbers[-1], 1, out)))
         if with_mass:
@@ -403,7 +402,7 @@ def closed_loop(
 
     def observe(t: int, state: ti.Ndarray, slot: int) -> None:
         """Observe the state before step t, and choose the actions of this step."""
-        numbers.append(particles.order.noted())
+        numbers.append(particles.noted_order())
         posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
         chosen = choose(t, simulator._observe(state, slot, stride, like), posed)
         if t < steps:
