@@ -25,12 +25,8 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     """Write a rollout as VTK XML files and an index of each series over time [s], which ParaView opens.
 
     Writes ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd``, with the
-    numbers of bodies and manipulators, and ``target.vtp``.
-
-    Args:
-        recording: The rollout, with motion.
-        folder: Folder to write to.
-        every: Environment steps from one frame to the next.
+    numbers of bodies and manipulators, and ``target.vtp``. The rollout must have motion; frames are ``every``
+    some environment steps.
     """
     scene = recording.scene
     series: dict[str, dict[float, str]] = {}
@@ -53,15 +49,8 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
 
 
 def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
-    """Write surfaces as PLY files with colours, for Blender.
-
-    Writes ``plasticine_0000.ply`` and ``manipulators_0000.ply`` for each frame, and ``target.ply``.
-
-    Args:
-        recording: The rollout.
-        folder: Folder to write to.
-        every: Environment steps from one frame to the next.
-    """
+    """Write surfaces as PLY files with colours, for Blender: ``plasticine_0000.ply`` and
+    ``manipulators_0000.ply`` for each frame, and ``target.ply``."""
     colors = {"plasticine": ("body", BODY_COLORS), "manipulators": ("manipulator", (MANIPULATOR_COLOR,))}
     for step, surfaces in _frames(recording, every):
         for name, mesh in surfaces.items():

@@ -25,13 +25,8 @@ def require_graphics() -> None:
 
 
 def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) -> None:
-    """Raise :class:`RenderError` if a package is missing.
-
-    Args:
-        who_needs: Beginning of the message: ``pictures need``.
-        packages: Display names by module.
-        extra: Extra that installs them.
-    """
+    """Raise :class:`RenderError` if a package, given by module and display name, is missing; ``who_needs``
+    begins the message, and ``extra`` installs it."""
     for package, name in packages.items():
         if find_spec(package) is None:
             raise RenderError(f"{who_needs} {name}, which is not installed: pip install 'plab[{extra}]'")

@@ -42,11 +42,7 @@ _RENDER_ERRORS = (
 
 
 def check_output(path: Path) -> None:
-    """Raise an error for unsupported files, before anything is computed.
-
-    Raises:
-        RenderError: If the suffix is not supported, or a required package is not installed.
-    """
+    """Raise RenderError if the suffix is not one of :data:`SUFFIXES`, or a package is not installed."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise RenderError(f"cannot write {path}: its suffix must be one of {', '.join(SUFFIXES)}")
@@ -62,9 +58,6 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         path: File to write; see :func:`check_output`.
         size: Width and height of a frame [pixels]; even numbers for MP4.
         every: Environment steps from one frame of a film to the next.
-
-    Raises:
-        RenderError: If the file cannot be written.
     """
     write = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}[path.suffix.lower()]
     with _renderer(recording, size) as renderer, _writing(path) as fresh:
@@ -72,18 +65,8 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
 
 
 def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *, film: bool) -> None:
-    """Write pictures of a rollout: ``start.webp``, ``target.webp`` and its last state ``end.webp``; and a
-    film ``end.mp4``, if wanted and imageio-ffmpeg is installed.
-
-    Args:
-        recording: The rollout.
-        folder: Folder to write to.
-        size: Width and height of a frame [pixels]; even numbers.
-        film: Whether to write a film.
-
-    Raises:
-        RenderError: If a file cannot be written.
-    """
+    """Write pictures of a rollout, of a size [pixels, even numbers]: ``start.webp``, ``target.webp`` and its
+    last state ``end.webp``; and a film ``end.mp4``, if wanted and imageio-ffmpeg is installed."""
     first, last = recording.poses[0], recording.poses[-1]
     with _renderer(recording, size) as renderer, _writing(folder / "end"):
         pictures = {"start": renderer.frame(recording.x[0], first), "target": renderer.target(first)}
@@ -105,7 +88,8 @@ def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Ren
 
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
-    """Create the folder of a file, and yield a temporary path that replaces the file on success."""
+    """Create the folder of a file, and yield a temporary path that replaces the file on success; RenderError
+    if it cannot be written."""
     fresh = path.with_name(f"{UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -222,15 +206,8 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
 
 
 def draw_strip(path: Path, picture: Path) -> None:
-    """Replay a run and draw start, target and end side by side.
-
-    Args:
-        path: The result file.
-        picture: PNG file to write.
-
-    Raises:
-        RenderError: If rendering is not possible, or the run cannot be replayed.
-    """
+    """Replay a run from its result file, and write start, target and end side by side as PNG; RenderError if
+    that is not possible."""
     require_graphics()
     try:
         save(record(*result(path)), picture, _PAGE_SIZE)

@@ -55,7 +55,7 @@ class Renderer:
         size: tuple[int, int] = (480, 360),
         camera: Camera | None = None,
     ) -> None:
-        """Set the scene up.
+        """Set up a scene.
 
         Args:
             scene: The scene.
@@ -117,17 +117,8 @@ class Renderer:
         return self._draw()
 
     def target(self, poses: np.ndarray) -> np.ndarray:
-        """Render the target as plasticine, with the static manipulators.
-
-        Args:
-            poses: As for :meth:`frame`.
-
-        Returns:
-            RGB picture, uint8, shape [height, width, 3].
-
-        Raises:
-            ValueError: If the renderer has no target, or the shape is wrong.
-        """
+        """Render the target as plasticine, with the static manipulators; arguments and result as of
+        :meth:`frame`."""
         if self._target is None:
             raise ArgumentError("this renderer has no target: give it target_mass")
         self._set_up(poses, moving=False)

@@ -65,12 +65,8 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
 
 
 def stored(path: Path) -> tuple[Config, np.ndarray]:
-    """Return the configuration for a replay, and the best actions of a result file.
-
-    Raises:
-        plab.results.ResultsError: If the file cannot be read.
-        RenderError: If it has no actions yet, or they do not fit its task.
-    """
+    """Return the configuration for a replay, and the best actions of a result file; ResultsError if the file
+    cannot be read, RenderError if it has no actions yet, or they do not fit its task."""
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
@@ -106,25 +102,18 @@ def _defaults() -> Config:
 
 
 def demonstration(cfg: Config) -> np.ndarray:
-    """Return the best known actions for a configuration, or zeros, shape [T, A].
-
-    Raises:
-        RenderError: If the known actions do not fit the scene.
-    """
+    """Return the best known actions for a configuration, or zeros, shape [T, A]; RenderError if they do not
+    fit the scene."""
     # Imported here, because replaying a result does not need its tables.
     from plab.demonstrations import known_actions
 
     scene, actions = build_scene(cfg), known_actions(cfg)
+    which = f"demonstration of {cfg.task.name}, variant {cfg.variant},"
     if actions is None:
-        print_once(
-            f"no demonstration of {cfg.task.name}, variant {cfg.variant}, is known: the manipulators stay put"
-        )
+        print_once(f"no {which} is known: the manipulators stay put")
         return np.zeros((scene.horizon, scene.action_dim))
-    if actions.shape[1] != scene.action_dim:
-        raise RenderError(
-            f"the demonstration of {cfg.task.name}, variant {cfg.variant}, has {actions.shape[1]} action "
-            f"components, but this scene takes {scene.action_dim}"
-        )
+    if (count := actions.shape[1]) != scene.action_dim:
+        raise RenderError(f"the {which} has {count} action components, this scene takes {scene.action_dim}")
     return actions
 
 

@@ -73,15 +73,8 @@ def _smooth(mesh: pv.PolyData) -> pv.PolyData:
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:
-    """Return the transform from a part's frame to the world.
-
-    Args:
-        pose: Position (3), quaternion w, x, y, z (4), gap (1), shape [8].
-        side: :attr:`Part.side`.
-
-    Returns:
-        Homogeneous matrix, shape [4, 4].
-    """
+    """Return the homogeneous matrix, shape [4, 4], from the frame of a part with a :attr:`Part.side` to the
+    world, given the pose: position (3), quaternion w, x, y, z (4), gap (1), shape [8]."""
     matrix = np.eye(4)
     # SciPy puts w last.
     matrix[:3, :3] = Rotation.from_quat(np.roll(pose[3:7], -1)).as_matrix()

@@ -71,12 +71,6 @@ def actor_policy(spaces: Spaces, hidden: Sequence[int]) -> Any:
     return policy
 
 
-def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """Set the learning rate of all parameters."""
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-
-
 class ActorTraining(Training):
     """A policy, its optimiser, and its training episodes.
 

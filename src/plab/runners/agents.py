@@ -27,7 +27,7 @@ from plab.runners.training import whole_cycles
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
     from torch import Tensor, nn
-    from torch.optim import Adam, Optimizer
+    from torch.optim import Adam
 
 LARGEST = 2**62
 """Bound of the random integers that are reduced modulo the requested range; uniform to 1e-12."""
@@ -257,9 +257,8 @@ class ReplayBuffer:
                         part.copy_(torch.from_numpy(numbers).view(part.shape))
         except (OSError, RuntimeError) as error:
             # The file is missing or shorter than required by the checkpoint.
-            raise ResultsError(
-                f"cannot read the replay buffer {path}: {error}; start afresh with force=true"
-            ) from error
+            remedy = "start afresh with force=true"
+            raise ResultsError(f"cannot read the replay buffer {path}: {error}; {remedy}") from error
 
     def _parts(self, agent: int, episode: int) -> list[Tensor]:
         """Return an episode's places in the buffers, in file order."""
@@ -326,13 +325,6 @@ def flat(tensors: Sequence[Tensor], agents: int) -> Tensor:
     return torch.cat([tensor.detach().reshape(agents, -1) for tensor in tensors], dim=1)
 
 
-def fill(tensors: Sequence[Tensor], agents: int, agent: int, row: Tensor) -> None:
-    """Write an agent's row of :func:`flat` back into stacked tensors."""
-    own = [tensor.detach().view(agents, -1)[agent] for tensor in tensors]
-    for part, numbers in zip(own, row.split([part.numel() for part in own]), strict=True):
-        part.copy_(numbers)
-
-
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Return x W + b for each network: shapes [stack, row, in], [stack, in, out], [stack, out]."""
     return torch.baddbmm(bias.unsqueeze(1), x, weight)
@@ -356,17 +348,14 @@ def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
-    """Return Adam for stacked parameters, with its state allocated in advance; one step updates all
-    agents."""
-    optimizer = torch.optim.Adam(parameters, lr=lr, fused=True, **options)
+    """Return Adam for stacked parameters, with its state allocated in advance; one step updates all agents,
+    and can be captured on CUDA."""
+    cuda, device = parameters[0].is_cuda, parameters[0].device
+    rate: Any = torch.tensor(lr, device=device) if cuda else lr
+    optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda, **options)
     for parameter in parameters:
-        optimizer.state[parameter] = {
-            "step": torch.zeros((), device=parameter.device),
-            "exp_avg": torch.zeros_like(parameter),
-            "exp_avg_sq": torch.zeros_like(parameter),
-        }
-    if parameters[0].is_cuda:
-        require_capturable(optimizer, lr)
+        moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+        optimizer.state[parameter] = {"step": torch.zeros((), device=device), **moments}
     return optimizer
 
 
@@ -416,41 +405,23 @@ class CapturedUpdate:
             return self._update(*arguments)
         self._calls += 1
         if self._calls <= WARM_UP:
-            return self._warm_up(*arguments)
+            # In a separate stream, as required for capture.
+            stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
+                result = self._update(*arguments)
+            current.wait_stream(stream)
+            return result
         shapes = tuple(argument.shape for argument in arguments)
         if shapes not in self._recordings:
-            self._recordings[shapes] = self._record(*arguments)
+            own, graph = tuple(argument.clone() for argument in arguments), torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                self._recordings[shapes] = graph, own, self._update(*own)
         graph, own, result = self._recordings[shapes]
         for mine, given in zip(own, arguments, strict=True):
             mine.copy_(given)
         graph.replay()
         return result
-
-    def _warm_up(self, *arguments: Tensor) -> Tensor:
-        # In a separate stream, as required for capture.
-        stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
-        stream.wait_stream(current)
-        with torch.cuda.stream(stream):
-            result = self._update(*arguments)
-        current.wait_stream(stream)
-        return result
-
-    def _record(self, *arguments: Tensor) -> tuple[torch.cuda.CUDAGraph, tuple[Tensor, ...], Tensor]:
-        own = tuple(argument.clone() for argument in arguments)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            result = self._update(*own)
-        return graph, own, result
-
-
-def require_capturable(optimizer: Optimizer, lr: float) -> None:
-    """Store Adam's learning rate in a CUDA tensor, and make its step capturable."""
-    for group in optimizer.param_groups:
-        group["capturable"] = True
-        if isinstance(group["lr"], torch.Tensor):
-            group["lr"].fill_(lr)
-        else:
-            group["lr"] = torch.tensor(lr, device=group["params"][0].device)
 
 
 # ----------------------------------------------------------------------------------------------------- agents
@@ -554,7 +525,10 @@ class Agents:
         """Restore an agent from one of :meth:`states`; the others must be restored to the same step. Raise
         RuntimeError if it belongs to another agent."""
         for name, tensors in self._tables().items():
-            fill(tensors, self.count, agent, torch.from_numpy(state[name]))
+            own = [tensor.detach().view(self.count, -1)[agent] for tensor in tensors]
+            numbers = torch.from_numpy(state[name]).split([part.numel() for part in own])
+            for part, known in zip(own, numbers, strict=True):
+                part.copy_(known)
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
         for name, optimizer in self.optimizers.items():
             for parameter in optimizer.param_groups[0]["params"]:
@@ -603,7 +577,7 @@ class OffPolicyAgents(Agents):
             shape = self.sizes.envs, self.sizes.actions
             self._actions = self.explore_at_random(self.draws.block("start", self.draws.uniform, *shape))
         else:
-            self._actions = self._captured(self._explore, observations, self.noise()).clone()
+            self._actions = self._captured(self.explore, observations, self.noise()).clone()
         return self._actions
 
     def noise(self) -> Tensor:
@@ -627,7 +601,3 @@ class OffPolicyAgents(Agents):
             for _ in range(self.sizes.envs if wanted < 0 else wanted):
                 self.updates += 1
                 self.update()
-
-    def _explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        with torch.no_grad():
-            return self.explore(observations, noise)

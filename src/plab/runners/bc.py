@@ -18,8 +18,8 @@ import numpy as np
 from plab.config import Config, ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorTraining, set_rate
-from plab.runners.policy import PolicyConfig, Spaces
+from plab.runners.actors import ActorTraining
+from plab.runners.policy import PolicyConfig, Spaces, set_rate
 from plab.runners.training import PolicyRunner, whole_cycles
 
 if TYPE_CHECKING:

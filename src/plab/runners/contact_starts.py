@@ -45,12 +45,8 @@ OVERSHOOT = (0.5, 1.5)
 
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
-    """Return the extent of a manipulator from its position in a direction, at its initial pose.
-
-    Args:
-        tool: The manipulator; for one that carries between its parts, such as chopsticks, the result is 0.
-        direction: Unit vector [3].
-    """
+    """Return the extent of a manipulator from its position in a direction, a unit vector [3], at its initial
+    pose; 0 for one that carries between its parts, such as chopsticks."""
     reach = tool.kind.support
     return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
 
@@ -64,15 +60,7 @@ class ContactStarts:
         self._tools = [m for m in scene.tools if m.action_dim]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
-        """Sample starts, alternately pushing and carrying.
-
-        Args:
-            count: Number of starts.
-            seed: Seed of the draws.
-
-        Returns:
-            Actions in [-1, 1], shape [count, T, A].
-        """
+        """Sample starts, alternately pushing and carrying: actions in [-1, 1], shape [count, T, A]."""
         rng = np.random.default_rng(seed)
         return np.stack(
             [self._with_joints((self._carry if k % 2 else self._push)(rng), rng) for k in range(count)]

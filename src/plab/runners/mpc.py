@@ -53,7 +53,6 @@ class MpcConfig(MethodConfig):
     planner: Any
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         if not isinstance(self.planner, PlannerConfig | TrajectoryConfig):
             raise ConfigError(f"{path}.planner cannot plan: choose cem, mppi, cmaes, multistart, adam or gd")
@@ -175,11 +174,6 @@ class MpcRunner(PlannerRunner):
         """Return to the initial state for the evaluation."""
         if hasattr(self, "_beginning"):
             self.problem.simulator.set_initial_state(self._beginning)
-
-    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report the progress of the episode."""
-        text = f"step {len(self._executed)} hard score {rows[0]['score']:.3f}"
-        self.report(tracks[0].iteration, text)
 
     def _execute(self, actions: np.ndarray) -> None:
         """Execute actions of shape [k, A] in the hard contact model, and plan from the resulting state."""

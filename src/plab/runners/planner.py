@@ -149,12 +149,8 @@ class Planner(ABC):
 
     @abstractmethod
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Make the first candidates.
-
-        Args:
-            random: Source of random numbers.
-            found: Candidates of the previous stage, best first, shape [N, T, A]; N is 0 in the first stage.
-        """
+        """Make the first candidates, given those of the previous stage, best first, shape [N, T, A]; N is 0
+        in the first stage."""
 
     @abstractmethod
     def iterate(self, random: torch.Generator) -> Asking:
@@ -316,12 +312,8 @@ class PlannerRunner(Runner):
             yield track, step
 
     def drive(self, walks: Mapping[Track, Asking]) -> tuple[dict[Track, Shown], dict[Track, list[int]]]:
-        """Make iterations of planners, evaluating their candidates together.
-
-        Returns:
-            Best candidates and their measures, of the runs that have not failed; and environment steps of
-            all, without and with gradient.
-        """
+        """Make iterations of planners, evaluating their candidates together; return best candidates and
+        measures of the runs that have not failed, and environment steps of all, without and with gradient."""
         spent, shown = {track: [0, 0] for track in walks}, dict[Track, Shown]()
         pending = {track: next(walk) for track, walk in walks.items()}
         while pending:

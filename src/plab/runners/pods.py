@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorConfig, set_rate, training_scenes
+from plab.runners.actors import ActorConfig, training_scenes
 from plab.runners.bc import Imitation
+from plab.runners.policy import set_rate
 from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:

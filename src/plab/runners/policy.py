@@ -33,6 +33,7 @@ from plab.scenes import DEVICES
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
     from stable_baselines3.common.policies import BasePolicy
+    from torch.optim import Optimizer
 
     from plab.envs.core import EpisodeBatch
 
@@ -74,7 +75,6 @@ class PolicyConfig(MethodConfig):
     hidden: list[int] = field(metadata=ranges.WIDTHS)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
 
@@ -115,6 +115,15 @@ def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
         torch.distributions.Distribution.set_default_validate_args(checks)
 
 
+def set_rate(optimizer: Optimizer, rate: float) -> None:
+    """Set the learning rate of all parameters, in place if it is a tensor."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], torch.Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
 def packed(state: Mapping[str, Any]) -> np.ndarray:
     """Serialise tensors and numbers in nested dictionaries and lists with torch.save."""
     buffer = io.BytesIO()
@@ -128,10 +137,8 @@ def unpacked(array: np.ndarray) -> dict[str, Any]:
 
 
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
-    """Return the initial policy of a training, on the CPU; the state of random generators is preserved.
-
-    It is created by ``make_policy(method, spaces)`` of the algorithm's rule.
-    """
+    """Return the initial policy of a training, created by ``make_policy(method, spaces)`` of the algorithm's
+    rule, on the CPU; the state of random generators is preserved."""
     rule = family(method.family).rules[method.algorithm].what
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -166,17 +173,8 @@ def policy_path(result: Path) -> Path:
 def save_policy(
     result: Path, method: PolicyConfig, policy: BasePolicy, moments: Moments | None = None
 ) -> None:
-    """Write a policy file beside the result.
-
-    Args:
-        result: The run's result file.
-        method: The section ``method`` of its configuration.
-        policy: Stable-Baselines3's policy.
-        moments: Moments that scale the observations, if any.
-
-    Raises:
-        ResultsError: If the file cannot be written.
-    """
+    """Write the policy file of a result, with the section ``method`` of its configuration and the moments
+    that scale observations, if any; ResultsError if that fails."""
     arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
         space = cast("Box", getattr(policy, f"{name}_space"))

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 from plab.config import Config, ConfigError, ranges
 from plab.plugins import torch
-from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp, require_capturable
-from plab.runners.policy import CLIP, EPSILON, Moments, Spaces
+from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp
+from plab.runners.policy import CLIP, EPSILON, Moments, Spaces, set_rate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -115,7 +115,8 @@ class PpoAgents(Agents):
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
         super().__init__(cfgs, spaces, device)
         agents, envs = self.count, self.sizes.envs
-        self._length = self.cycle_steps(self.method, self.sizes.horizon) // envs
+        self._size = self.cycle_steps(self.method, self.sizes.horizon)
+        self._length = self._size // envs
         few = self.method.statistics_episodes
         self._watched = math.inf if few is None else few * self.sizes.horizon
         # Coefficient of the sum of the entropies of an action's components.
@@ -198,9 +199,15 @@ class PpoAgents(Agents):
         self.rollout["rewards"][:, :, len(self._over)] = rewards
         self._over.append(over)
         if len(self._over) == self._length:
-            self._decay()
+            if self.method.lr_decay:
+                began = self.steps + self.sizes.envs - self._size
+                set_rate(self.optimizers["policy"], self.method.lr * (1.0 - began / self.total_steps))
             self.judge(self._values(observations), self._over)
-            self._improve()
+            rows = math.ceil(self._size / self.method.minibatches)
+            for _ in range(self.method.epochs):
+                for numbers in self.draws.permutation(self._size).split(rows, dim=1):
+                    self._note(self._captured(self.minibatch, numbers.contiguous()))
+                self.updates += 1
             self._over = []
         self.steps += self.sizes.envs
 
@@ -256,27 +263,6 @@ class PpoAgents(Agents):
         loss = policy_loss + self._entropy * entropy_loss + m.value_coefficient * value_loss
         descend(self.optimizers["policy"], loss, m.max_gradient_norm)
         return torch.stack([part.detach() for part in (policy_loss, value_loss, entropy_loss)])
-
-    @property
-    def _size(self) -> int:
-        return self.sizes.envs * self._length
-
-    def _improve(self) -> None:
-        rows = math.ceil(self._size / self.method.minibatches)
-        for _ in range(self.method.epochs):
-            for numbers in self.draws.permutation(self._size).split(rows, dim=1):
-                self._note(self._captured(self.minibatch, numbers.contiguous()))
-            self.updates += 1
-
-    def _decay(self) -> None:
-        if not self.method.lr_decay:
-            return
-        began = self.steps + self.sizes.envs - self._size
-        lr = self.method.lr * (1.0 - began / self.total_steps)
-        if self.device.type == "cuda":
-            require_capturable(self.optimizers["policy"], lr)
-        else:
-            self.optimizers["policy"].param_groups[0]["lr"] = lr
 
     def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return means of actions, shape [agent, row, action], and values, shape [agent, row]."""

@@ -54,13 +54,8 @@ class Runner:
     report: Report
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-        """Take over some runs, as alike as :func:`plab.sweep.running.plan` asks for; nothing is built yet.
-
-        Args:
-            tracks: The runs.
-            note: Text before the progress.
-            cache: Simulators of earlier runs.
-        """
+        """Take over some runs, as alike as :func:`plab.sweep.running.plan` asks for, with a text before their
+        progress; nothing is built yet."""
         self.tracks = list(tracks)
         for number, track in enumerate(tracks):
             track.number = number
@@ -86,24 +81,14 @@ class Runner:
         return cast(int, row_count(asdict(track.cfg.method)))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Make the next iteration of some runs; by default :meth:`step` of each.
-
-        Args:
-            tracks: The unfinished runs.
-
-        Yields:
-            The successful runs; mark failed ones with :meth:`Track.fail`.
-        """
+        """Make the next iteration of unfinished runs; by default :meth:`step` of each. Yield the successful
+        ones; mark failed ones with :meth:`Track.fail`."""
         for track in tracks:
             yield track, self.step(track)
 
     def step(self, track: Track) -> Step:
-        """Make one iteration of one run.
-
-        Raises:
-            plab.sim.SimulationError: If a state, loss or gradient diverges.
-            plab.runners.RunError: If it fails for another reason.
-        """
+        """Make one iteration of one run; SimulationError if a state, loss or gradient diverges, RunError if
+        it fails for another reason."""
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
@@ -164,7 +149,6 @@ class Runner:
         Raises:
             TogetherError: If several runs do not fit into one simulator, but fewer might.
             plab.config.ConfigError: If a required package or device is missing.
-            plab.results.ResultsError: If the file of a single run cannot be written.
             plab.runners.RunError: If a single run cannot be built, or all runs have failed.
         """
         from plab.config.compose import require_runnable

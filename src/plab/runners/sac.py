@@ -77,8 +77,9 @@ class SacAgents(OffPolicyAgents):
         return policy
 
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        mean, log_std = self._gaussian(observations)
-        return torch.tanh(mean + log_std.exp() * noise)
+        with torch.no_grad():
+            mean, log_std = self._gaussian(observations)
+            return torch.tanh(mean + log_std.exp() * noise)
 
     def decide(self, observations: Tensor) -> Tensor:
         with torch.no_grad():

@@ -154,21 +154,12 @@ class SamplerConfig(PlannerConfig):
 
 
 def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
-    """Return the actions of curves.
-
-    Args:
-        knots: Points, evenly spaced in time, shape [P, K, A].
-        steps: Environment steps T.
-        curve: ``constant`` or ``linear``.
-
-    Returns:
-        Actions in [-1, 1], shape [P, T, A].
-    """
-    by_component = knots.transpose(1, 2)
+    """Return the actions of ``constant`` or ``linear`` curves, in [-1, 1], shape [P, T, A], given points
+    evenly spaced in time, shape [P, K, A], and the number T of steps."""
+    options: dict[str, Any] = {"mode": "linear", "align_corners": True}
     if curve == "constant":
-        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="nearest")
-    else:
-        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="linear", align_corners=True)
+        options = {"mode": "nearest"}
+    drawn = torch.nn.functional.interpolate(knots.transpose(1, 2), size=steps, **options)
     return drawn.transpose(1, 2).clamp(-1.0, 1.0)
 
 

@@ -21,14 +21,8 @@ from typing import TYPE_CHECKING, Any
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import (
-    ActorConfig,
-    ActorTraining,
-    actor_network,
-    actor_policy,
-    set_rate,
-)
-from plab.runners.policy import Spaces
+from plab.runners.actors import ActorConfig, ActorTraining, actor_network, actor_policy
+from plab.runners.policy import Spaces, set_rate
 from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:

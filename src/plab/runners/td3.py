@@ -72,7 +72,7 @@ class Td3Agents(OffPolicyAgents):
         )
 
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        return self._noisy(self._actor("actor", observations), noise)
+        return self._noisy(self.decide(observations), noise)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Add noise to random actions, too, as Stable-Baselines3 does."""

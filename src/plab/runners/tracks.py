@@ -125,14 +125,8 @@ class Track:
         return Outcome.of(self.cfg, "refused" if _is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
-        """Mark the run as failed, also in its file, which keeps the results so far; the rest of the batch
-        continues.
-
-        A run that is rejected before its first iteration leaves no file.
-
-        Args:
-            why: An error, or the reason of the failure in the current iteration.
-        """
+        """Mark the run as failed because of an error, or a reason in the current iteration, also in its file,
+        which keeps the results so far. A run that is rejected before its first iteration leaves no file."""
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
         if isinstance(error, ResultsError) or (_is_refusal(error) and not self.run.advanced):
             # After a ResultsError nothing can be written to the file.
@@ -152,15 +146,8 @@ class Track:
             self.fail(error)
 
     def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
-        """Write an iteration to the file; return its row.
-
-        Args:
-            step: Result of the iteration.
-            columns: Names of the measures to keep.
-
-        Raises:
-            ResultsError: If the file cannot be written.
-        """
+        """Write an iteration, with the measures of some columns, to the file and return its row; ResultsError
+        if the file cannot be written."""
         horizon, before = len(step.actions), sum(self._budget.values())
         episodes = before // horizon if step.episodes is None else step.episodes
         steps = episodes * horizon if step.steps is None else step.steps
@@ -228,11 +215,8 @@ class Outcome:
 
 
 def report(outcomes: Sequence[Outcome]) -> int:
-    """Print a summary line of a sweep, and a line on standard error per run without a result.
-
-    Returns:
-        Exit code: 0 if all results exist, 2 for invalid input, otherwise 1.
-    """
+    """Print a summary line of a sweep, and a line on standard error per run without a result; return the exit
+    code: 0 if all results exist, 2 for invalid input, otherwise 1."""
     count = Counter(one.status for one in outcomes)
     parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
     unfinished = ("failed", "refused", *_UNFINISHED)

@@ -65,12 +65,8 @@ class Evaluation:
 
 
 def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluation]:
-    """Run an episode of a deterministic policy in each environment of a batch.
-
-    Args:
-        env: The environments.
-        decide: Maps observations, shape [env, entry], to actions, shape [env, A].
-    """
+    """Run an episode of a deterministic policy in each environment of a batch; ``decide`` maps observations,
+    shape [env, entry], to actions, shape [env, A]."""
     columns = episode_columns(env.batch.problem.term_names)
     observations = env.reset()
     sums: dict[str, Tensor] = {}
