@@ -335,10 +335,7 @@ class EpisodeBatch:
 
     @property
     def problem(self) -> Problem:
-        """Scenes, targets and simulator of the sub-environments.
-
-        RuntimeError if the environment is closed.
-        """
+        """Scenes, targets and simulator of the batch; RuntimeError if the environment is closed."""
         if self._problem is None:
             raise RuntimeError("the environment is closed: make a new one")
         return self._problem
@@ -407,15 +404,14 @@ class EpisodeBatch:
         self._steps[rows], self._over[rows] = 0, False
         self._failures = {e: text for e, text in self._failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
-        before = self._last
         if changed or self.draws.changed or environments is not None or on_device(like):
             measured = self._measured(like)
             if changed:
                 self._note_starts(rows, *measured[:2])
-            self._last = self._observe(like), *measured
+            others = [e for e in range(self.size) if e not in rows]
+            self._update(self._observe(like), measured, kept=others)
         else:
             self._last = self._initial
-        self._keep(before, [e for e in range(self.size) if e not in rows])
         # Copies, because callers may keep and modify them.
         self._last = _copies(self._last)
         return self._shown()
@@ -431,14 +427,15 @@ class EpisodeBatch:
         self._initial_loss = Constants(loss)
         self._new_observer()
 
-    def _keep(self, before: tuple[Array, ...], rows: Sequence[int]) -> None:
-        """Restore the last observations and measures of some environments, arrays or CUDA tensors."""
+    def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
+        """Store observations and measures, arrays or CUDA tensors; some environments keep their last ones."""
 
         def restore(table: Array, old: Array) -> None:
-            kept = old[rows]
-            table[rows] = _tensor_like(table, kept) if on_device(table) else _on_host(kept)
+            own = old[kept]
+            table[kept] = _tensor_like(table, own) if on_device(table) else _on_host(own)
 
-        for table, old in zip(self._last, before, strict=True) if rows else ():
+        before, self._last = self._last, (observation, *measured)
+        for table, old in zip(self._last, before, strict=True) if kept else ():
             mapped(restore, table, old)
 
     def require_running(self, idle: np.ndarray | bool = False) -> None:
@@ -477,8 +474,7 @@ class EpisodeBatch:
                 raise
             # Raised once per step; the second call returns the measures of the others.
             self._failures, measured = error.failures | self._failures, self._measured(actions)
-        before, self._last = self._last, (observation, *measured)
-        self._keep(before, list(self._failures))
+        self._update(observation, measured, kept=list(self._failures))
         observation, info = self._shown()
         reward = self._initial_loss.like(actions) - info["loss"]
         if self._stages:
@@ -505,8 +501,7 @@ class EpisodeBatch:
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
             measured = self._measured(like)
             self._note_starts(rows, *measured[:2])
-            before, self._last = self._last, (self._observe(like), *measured)
-            self._keep(before, list(self._failures))
+            self._update(self._observe(like), measured, kept=list(self._failures))
         info |= self._stage_info(info["score"])
         return reward
 

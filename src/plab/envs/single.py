@@ -69,9 +69,6 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
 
         Returns:
             Observation, shape [entry], float32, or by key, and ``info``.
-
-        Raises:
-            ValueError: If an option does not fit.
         """
         super().reset(seed=seed)
         return _first(*self.batch.reset(seeds=self._first_seeds(seed), options=options))

@@ -84,9 +84,6 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Returns:
             Observations, shape [env, entry], float32, or by key, and ``info``.
-
-        Raises:
-            ValueError: If an option does not fit.
         """
         given = dict(options or {})
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)))

@@ -158,18 +158,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of plasticine, initially filled with particles.
+    """One body of plasticine, initially filled with uniformly sampled particles.
 
-    Attributes:
-        shape: ``sphere`` or ``box``; that of a :class:`MeshBody` is ``mesh``.
-        center: Centre [domain units].
-        size: Sphere: ``(radius,)``. Box: full edge lengths ``(x, y, z)``.
-        particles: Number of particles drawn uniformly inside.
-        youngs_modulus: Young's modulus E; the scene's if None.
-        poisson_ratio: Poisson ratio nu; the scene's if None.
-        yield_stress: von Mises yield stress; the scene's if None.
-        law: Name of its law, see :func:`find_law`; ``von_mises`` if None.
-        parameters: Other parameters of the law, by name.
+    Attributes are those of :class:`plab.config.BodyConfig`: ``shape``, ``center`` and ``size`` [domain
+    units], ``particles``, and its own material, of which parts that are None are the scene's.
     """
 
     shape: str
@@ -215,12 +207,10 @@ class MeshBody(Body):
     mesh: Mesh
 
     def half_extent(self) -> np.ndarray:
-        """See :meth:`Body.half_extent`."""
         return self.size[0] / 2 * self.mesh.extent
 
     @property
     def volume(self) -> float:
-        """See :attr:`Body.volume`."""
         return math.prod(self.size * 3) * self.mesh.volume
 
 
@@ -355,18 +345,9 @@ MANIPULATORS_MAX = 31
 class Manipulator:
     """One rigid, kinematic manipulator.
 
-    Attributes:
-        shape: Key of :data:`MANIPULATOR_SHAPES`.
-        size: Lengths named by ``MANIPULATOR_SHAPES[shape].size_names``.
-        position: Position at t = 0.
-        rotation: Unit quaternion (w, x, y, z) at t = 0, to three digits.
-        scale: Motion over one environment step at action 1, one number per action component (lengths, or
-            radians).
-        friction: Coulomb friction coefficient with the plasticine.
-        lower_bound: Lowest position, clamped after every substep.
-        upper_bound: Highest position.
-        gap: Distance between the axes of the chopsticks at t = 0; unused by other shapes.
-        minimal_gap: Smallest gap the chopsticks can close to.
+    Attributes are those of :class:`plab.config.ManipulatorConfig`. Lengths in ``size`` are named by
+    ``MANIPULATOR_SHAPES[shape].size_names``; bounds of the position are applied after every substep; other
+    shapes than chopsticks do not use ``gap`` and ``minimal_gap``.
     """
 
     shape: str

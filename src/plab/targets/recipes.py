@@ -68,16 +68,7 @@ class PointsRecipe(TensorRecipe):
 
 @dataclass
 class TargetBody:
-    """One solid body of a target.
-
-    Attributes:
-        shape: ``sphere``, ``box`` or ``mesh``.
-        center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
-        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
-            its bounding box.
-        file: Mesh only: OBJ, STL or PLY file, as of :class:`plab.config.BodyConfig`.
-        sha256: Mesh only: SHA-256 of the file, likewise.
-    """
+    """One solid body of a target; attributes are those of :class:`plab.config.BodyConfig`."""
 
     shape: str
     center: list[float]
@@ -86,8 +77,7 @@ class TargetBody:
     sha256: str | None = None
 
     def build(self, particles: int) -> Body:
-        """Return the body with the given number of particles; see :func:`plab.scenes.make_body` for
-        errors."""
+        """Return the body with so many particles; see :func:`plab.scenes.make_body` for errors."""
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 
