@@ -27,7 +27,6 @@ from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
-from plab.report.figures import precision_summary
 from plab.scenes import DEVICES, Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
@@ -194,6 +193,24 @@ def main(argv: Sequence[str]) -> None:
         lines += ["| " + " | ".join(map(str, row)) + " |" for row in worst.itertuples(index=False)]
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
         options.markdown.write_text(heading + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the worst and the median difference of float32 from float64, per task and kind of actions, from
+    the table of :func:`compare`."""
+    score, turn = table["difference"].astype(float).abs(), table["angle_deg"].astype(float)
+    groups = table.assign(score=score, turn=turn, failed=table["failures"].fillna("").ne("")).groupby(
+        ["task", "actions"], sort=False
+    )
+    columns = {
+        "configurations": groups.size(),
+        "largest difference of scores": groups["score"].max().map("{:.1e}".format),
+        "median": groups["score"].median().map("{:.1e}".format),
+        "largest angle of gradients [deg]": groups["turn"].max().map("{:.2g}".format),
+        "median angle [deg]": groups["turn"].median().map("{:.2g}".format),
+        "failures": groups["failed"].sum(),
+    }
+    return pd.DataFrame(columns).replace("nan", "-").reset_index()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Accuracy
 #
-# Errors relative to much finer simulations, and the effects of single precision and of the contact model.
+# Errors relative to much finer simulations, and the effect of the contact model.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
@@ -25,10 +25,10 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 import numpy as np
 import pandas as pd
 
-from plab.report.figures import Drawing, diagrams, legend, precision_summary, single, style
+from plab.report.figures import Drawing, diagrams, legend, single, style
 from plab.report.methods import method
 from plab.report.notebook_cells import benchmark, gather, show_figure, show_origin, show_table
-from plab.report.reference import ACCURACY, PRECISION, origin
+from plab.report.reference import ACCURACY
 from plab.report.statistics import load_series
 from plab.report.tables import number
 
@@ -45,14 +45,6 @@ if table is not None:
         drawings = diagrams(table)
     for drawing in drawings:
         show_figure(drawing)
-
-# %% [markdown]
-# ## float32 against float64
-
-# %%
-table = benchmark(BENCH, PRECISION)
-if table is not None:
-    show_table(precision_summary(table), origin(table))
 
 # %% [markdown]
 # ## Soft and hard contact

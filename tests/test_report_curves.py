@@ -167,9 +167,9 @@ def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path,
         synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS))
     words = ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac", "--split", "task.yield_stress"]
     assert main(["curves", *words, str(folder), str(more), "--out", str(out)]) == 0
-    assert "7 figures" in capsys.readouterr().out
+    assert "6 figures" in capsys.readouterr().out
     for suffix in (".pdf", ".png"):
-        assert len(list(out.glob(f"*{suffix}"))) == 7
+        assert len(list(out.glob(f"*{suffix}"))) == 6
     for path in out.glob("*.pdf"):
         image = path.read_bytes()
         assert b"/Type3" not in image and b"/FontFile2" in image

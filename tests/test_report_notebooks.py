@@ -8,13 +8,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-import precision
 import synthetic
 from plab.bench import accuracy, speed
 from plab.cli.report import main
-from plab.report.figures import precision_summary
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
-from plab.report.reference import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
+from plab.report.reference import ACCURACY, SPEED, Benchmark, measured, origin
 from plab.results import ResultsError
 from plab.results.examples import measurements
 
@@ -48,17 +46,7 @@ def accuracy_rows() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def precision_rows() -> pd.DataFrame:
-    row = {"task": "Move", "variant": "1", "actions": "random", "difference": -2e-5, "angle_deg": 0.02}
-    return pd.DataFrame([row | {"failures": ""}, row | {"difference": 1e-6, "failures": "not finite"}])
-
-
-WRITTEN = {ACCURACY: accuracy.COLUMNS, PRECISION: precision.COLUMNS, SPEED: speed.PAPER_COLUMNS}
-
-
-def test_precision_is_summed_up_by_its_worst() -> None:
-    (row,) = precision_summary(precision_rows()).to_dict("records")
-    assert row["largest difference of scores"] == "2.0e-05" and row["failures"] == 1
+WRITTEN = {ACCURACY: accuracy.COLUMNS, SPEED: speed.PAPER_COLUMNS}
 
 
 @pytest.mark.parametrize("benchmark", WRITTEN, ids=lambda benchmark: benchmark.file)
@@ -97,7 +85,7 @@ def run_cells(name: str, monkeypatch: pytest.MonkeyPatch, **parameters: object) 
 EXPECTED = {
     "reproduction": ("(6/15)", "Agree: within two"),
     "speed": ("benchmark, H200, float32, batch 1", "speed.csv, SHA-256"),
-    "accuracy": ("2.0e-05", "accuracy.csv, SHA-256", "precision.csv, SHA-256"),
+    "accuracy": ("accuracy.csv, SHA-256", "mean change"),
     "anatomy": ("Rope, variant", "pictures need a painter", "evaluation: score"),
 }
 
@@ -108,7 +96,7 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
     speed = measured(measurements("example") / SPEED.file, SPEED)
     bench, nothing = tmp_path / "bench", tmp_path / "nothing"
     bench.mkdir(), nothing.mkdir()
-    for benchmark, rows in ((ACCURACY, accuracy_rows()), (PRECISION, precision_rows()), (SPEED, speed)):
+    for benchmark, rows in ((ACCURACY, accuracy_rows()), (SPEED, speed)):
         rows.to_csv(bench / benchmark.file, index=False)
     command = "plab report notebooks"
     text = run_cells(name, monkeypatch, RESULTS=[str(results)], BENCH=str(bench), COMMAND=command)
@@ -116,7 +104,7 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
     assert all(part in text for part in EXPECTED[name])
     text = run_cells(name, monkeypatch, RESULTS=[str(nothing)], BENCH=str(nothing))
     assert text.count("There are no finished runs in") == 1
-    for benchmark in {"speed": (SPEED,), "accuracy": (ACCURACY, PRECISION)}.get(name, ()):
+    for benchmark in {"speed": (SPEED,), "accuracy": (ACCURACY,)}.get(name, ()):
         assert f"There is no {nothing / benchmark.file}: `" in text
 
 

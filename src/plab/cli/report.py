@@ -38,8 +38,8 @@ def main(argv: Sequence[str]) -> None:
     add("--out", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by plab bench speed --paper --csv, for the table of times"
     add("--speed", type=Path, help=what)
-    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv; example: those that come with "
-    what += "plab (default: reports/bench; example where the results come with plab)"
+    what = "notebooks: folder of speed.csv and accuracy.csv; example: those that come with plab (default: "
+    what += "reports/bench; example where the results come with plab)"
     add("--bench", type=measurements, help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     add("--no-pictures", dest="pictures", action="store_false", help=what)

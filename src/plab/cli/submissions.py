@@ -118,7 +118,9 @@ def verify(argv: Sequence[str]) -> int:
         parser.error("name a submission, or a folder of them")
     precisions = PRECISIONS[:1] if options.float32 else PRECISIONS
     codes = []
-    for path in _submissions(sources):
+    if missing := [source for source in sources if not submission_files(source)]:
+        raise SubmissionError(f"{missing[0]} has no submissions, files <name>{SUFFIX}")
+    for path in (path for source in sources for path in submission_files(source)):
         try:
             submission = read(path)
             found = simulate_again(
@@ -140,16 +142,6 @@ def verify(argv: Sequence[str]) -> int:
     return max(codes)
 
 
-def _submissions(sources: Sequence[Path]) -> list[Path]:
-    found = []
-    for source in sources:
-        inside = submission_files(source) if source.is_dir() else [source]
-        if not inside:
-            raise SubmissionError(f"{source} has no submissions, files <name>{SUFFIX}")
-        found += inside
-    return found
-
-
 def _show(submission: Submission, verification: Verification, precisions: Sequence[str]) -> None:
     name = submission.card.name if submission.card else "a recording"
     print(f"{name}: {submission.track}, plab {submission.plab}, simulated by plab {plab.__version__}")
@@ -157,8 +149,7 @@ def _show(submission: Submission, verification: Verification, precisions: Sequen
     for verdict in verification.verdicts:
         entry, scores = verdict.entry, verdict.scores
         numbers = [f"{scores[p]:.4f}" if p in scores else "" for p in precisions]
-        first = scores.get(precisions[0])
-        difference = "" if first is None else f"{first - entry.score:+.4f}"
+        difference = f"{scores[precisions[0]] - entry.score:+.4f}" if scores else ""
         claim = (entry.configuration.name, f"{entry.steps:,}", f"{entry.score:.4f}")
         rows.append((*claim, *numbers, difference))
     print_table(("configuration", "steps", "claimed", *precisions, "difference"), rows)

@@ -26,17 +26,13 @@ from plab.report.reference import origin, paper_table
 from plab.report.statistics import (
     Rows,
     Series,
-    at_budgets,
     band,
     improvement,
     interquartile_mean,
     shared_strata,
-    strata_of,
 )
 from plab.report.tables import (
     AGREES,
-    BUDGET_NOTES,
-    NOTHING,
     TOLERANCE,
     compared_cells,
     demonstration_scores,
@@ -147,9 +143,6 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
 
 # ------------------------------------------------------------------------------------------------------ runs
 
-_POINTS = 60
-"""Points of a curve against budgets."""
-
 
 def rewards(runs: Runs, series: Series) -> list[Drawing]:
     """Return reward against episodes, per task and per configuration, all methods on one axis."""
@@ -175,24 +168,6 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         Drawing("reward_per_task", _per_task(runs, draw, "episodes", "reward"), notes),
         Drawing("reward_per_configuration", figure, notes),
     ]
-
-
-def budget_curves(runs: Runs, series: Series) -> Drawing:
-    """Return the score of the best actions so far against simulated environment steps, per task."""
-
-    def draw(panel: Axes, task: str) -> None:
-        by_method = strata_of(series, task)
-        for name in (one for one in runs.methods if one in by_method):
-            tables = [table for own in by_method[name] for table in own]
-            first, last = (max(table["simulated"][k] for table in tables) for k in (0, -1))
-            budgets = np.unique(np.geomspace(first, last, _POINTS).round())
-            found = at_budgets(by_method[name], budgets)
-            means, low, high = np.array([(one.value, one.low, one.high) for one in found]).T
-            draw_range(panel, name, budgets, means, low.clip(0.0), high.clip(max=1.0))
-        panel.set(ylim=(0.0, 1.05), xscale="log")
-
-    figure = _per_task(runs, draw, "environment steps", "score of best actions")
-    return Drawing("score_at_budget", figure, [*BUDGET_NOTES, *settings_note(runs)])
 
 
 def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
@@ -415,21 +390,3 @@ def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str)
         for x, count in rows.loc[rows["outcome"] != "stable", [cost, varied]].itertuples(index=False):
             panel.plot(x, 1.0, "x", color=colour, transform=above, clip_on=False, markersize=4)
             panel.annotate(str(count), (x, 1.0), xytext=(0, 4), ha="center", xycoords=above, **small)
-
-
-def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the worst and the median difference of float32 from float64, per task and kind of actions, from
-    the table of ``benchmarks/precision.py``."""
-    score, turn = table["difference"].astype(float).abs(), table["angle_deg"].astype(float)
-    groups = table.assign(score=score, turn=turn, failed=table["failures"].fillna("").ne("")).groupby(
-        ["task", "actions"], sort=False
-    )
-    columns = {
-        "configurations": groups.size(),
-        "largest difference of scores": groups["score"].max().map("{:.1e}".format),
-        "median": groups["score"].median().map("{:.1e}".format),
-        "largest angle of gradients [deg]": groups["turn"].max().map("{:.2g}".format),
-        "median angle [deg]": groups["turn"].median().map("{:.2g}".format),
-        "failures": groups["failed"].sum(),
-    }
-    return pd.DataFrame(columns).replace("nan", NOTHING).reset_index()

@@ -63,11 +63,6 @@ ACCURACY = Benchmark(
         *("positions", "gradient", "outcome"),
     ),
 )
-PRECISION = Benchmark(
-    "precision.csv",
-    "python benchmarks/precision.py --csv {file}",
-    ("task", "actions", "difference", "angle_deg", "failures"),
-)
 
 
 def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:

@@ -415,15 +415,6 @@ def demonstration_scores() -> pd.DataFrame:
 
 # ---------------------------------------------------------------------------------------------- equal budgets
 
-BUDGET_NOTES = [
-    "Score of the best actions found within a budget of simulated environment steps, those with a gradient "
-    "counted like those without. Rows of planners and RL methods are of the hard contact model, those of "
-    "gradient methods of that of their rollouts.",
-    f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t, its variance estimated over the "
-    "seeds of each variant: none where a variant has one run.",
-    "A run that has ended keeps its score. A method has no score before all of its runs have a row.",
-]
-
 
 def score_at_budget(runs: Runs, series: Series) -> list[Table]:
     """Return the table of scores at equal budgets, a row per task and method."""
@@ -443,7 +434,15 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
     columns = ["task", "method", "runs", *(f"{budget:,.0f} steps" for budget in budgets)]
     shown = pd.DataFrame(cells, columns=columns)
     data = pd.DataFrame(rows, columns=["task", "method", "runs", "steps", "score", "low", "high", "seconds"])
-    notes = [*BUDGET_NOTES, *settings_note(runs)]
+    notes = [
+        "Score of the best actions found within a budget of simulated environment steps, those with a "
+        "gradient counted like those without. Rows of planners and RL methods are of the hard contact model, "
+        "those of gradient methods of that of their rollouts.",
+        f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t, its variance estimated over the "
+        "seeds of each variant: none where a variant has one run.",
+        "A run that has ended keeps its score. A method has no score before all of its runs have a row.",
+        *settings_note(runs),
+    ]
     return [Table("score_at_budget", "ours", "Score at equal budgets", shown, data, notes=notes, long=True)]
 
 

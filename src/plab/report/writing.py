@@ -85,10 +85,8 @@ def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
     drawings: list[Drawing] = []
     with figures.style():
         if len(runs.table):
-            series = load_series(runs)
             drawings += [
-                *figures.rewards(runs, series),
-                figures.budget_curves(runs, series),
+                *figures.rewards(runs, load_series(runs)),
                 *figures.rl_scores(runs),
                 *figures.agreement_plot(runs),
                 *figures.aggregates(runs),

@@ -3,14 +3,14 @@
 The layout is described in docs/developers/format.md. A run in progress stores its state in
 ``<name>.partial.h5``, which is replaced atomically at intervals: after a kill, the previous version remains,
 from which the same command resumes. Finished runs can be packed into archives, which load like folders. This
-package does not import torch or Taichi, so that reading results is fast.
+package does not import torch or Taichi, and pandas and DuckDB on demand, so that runs start fast.
 """
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from plab.config.run import config_dict, config_hash
 from plab.config.selection import lookup
+from plab.results.archive import pack, unpack
+from plab.results.checking import Fault, check
+from plab.results.query import connect
 from plab.results.running import RunFile, read, write
 from plab.results.schema import (
     BUDGETS,
@@ -22,19 +22,7 @@ from plab.results.schema import (
     RunResult,
     row_count,
 )
-
-if TYPE_CHECKING:
-    from plab.results.archive import pack, unpack
-    from plab.results.checking import Fault, check
-    from plab.results.query import connect
-    from plab.results.table import Row, load, read_curves, rows
-
-_LAZY = {
-    **dict.fromkeys(("Row", "load", "read_curves", "rows"), "table"),
-    **dict.fromkeys(("pack", "unpack"), "archive"),
-    **dict.fromkeys(("Fault", "check"), "checking"),
-    "connect": "query",
-}
+from plab.results.table import Row, load, read_curves, rows
 
 __all__ = [
     "BUDGETS",
@@ -61,10 +49,3 @@ __all__ = [
     "unpack",
     "write",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Import functions for many results on demand, because runs do not need them or pandas."""
-    if name in _LAZY:
-        return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,8 +19,6 @@ from plab.config.selection import lookup
 from plab.files import LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
-    PARTIAL_SUFFIX,
-    PROGRESS_SUFFIX,
     SCHEMA_VERSION,
     NewerSchemaError,
     ResultsError,
@@ -162,15 +160,6 @@ def run_of(file: h5py.File, path: Path) -> RunResult:
         resume=_tree(file["resume"]) if "resume" in file else None,
         path=path,
     )
-
-
-def read_progress(path: Path) -> dict[str, float]:
-    """Return ``rows``, ``episodes`` and ``score`` of a run in progress if newer than its partial file
-    ``path``, otherwise empty."""
-    stem = path.name.removesuffix(PARTIAL_SUFFIX)
-    with suppress(OSError, ValueError):
-        return dict(json.loads(path.with_name(stem + PROGRESS_SUFFIX).read_text()))
-    return {}
 
 
 def split_archive(path: Path) -> tuple[Path, str] | None:

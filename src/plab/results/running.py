@@ -12,7 +12,6 @@ import dataclasses
 import errno
 import functools
 import itertools
-import json
 import logging
 import math
 import os
@@ -32,19 +31,15 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from plab.config.run import config_dict, config_hash, member_name
-from plab.results.run_file import read, replace_file, write
+from plab.results.run_file import read, write
 from plab.results.schema import (
     PARTIAL_SUFFIX,
-    PROGRESS_SUFFIX,
     REPLAY_SUFFIX,
     NewerSchemaError,
     ResultsError,
     RunBusyError,
     RunResult,
 )
-
-_PROGRESS_EVERY = 1.0
-"""Interval at which a run updates its progress file [s]."""
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +71,6 @@ class RunFile:
         known = RunResult(config, digest, provenance=provenance(config))
         self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
-        self._progress, self._reported = self.path.with_suffix(PROGRESS_SUFFIX), time.monotonic()
         self._lock: Lock | None = None
         # Files and number of iterations of earlier processes.
         self._found: set[Path] = set()
@@ -132,7 +126,7 @@ class RunFile:
     def _remove(self, *suffixes: str) -> None:
         """Remove temporary files of the run, and those with the given suffixes."""
         for path in self._files():
-            if path.name.endswith((".tmp", PROGRESS_SUFFIX, *suffixes)):
+            if path.name.endswith((".tmp", *suffixes)):
                 path.unlink(missing_ok=True)
 
     def discard(self) -> None:
@@ -178,8 +172,6 @@ class RunFile:
         """Release the run's lock, so that another process may resume it; nothing may be written
         afterwards."""
         if self._lock is not None:
-            with suppress(OSError):
-                self._progress.unlink(missing_ok=True)
             self._lock.release()
 
     def add_time(self, name: str, seconds: float) -> None:
@@ -203,20 +195,6 @@ class RunFile:
         now = time.monotonic()
         if keep or now - self._written >= self._every:
             self._write()
-        if now - self._reported >= _PROGRESS_EVERY:
-            self._reported = now
-            self._report(row)
-
-    def _report(self, row: Mapping[str, float]) -> None:
-        """Write the progress for ``plab status``: rows, episodes, and the score of the best row."""
-        known = self.result
-        score = known.columns.get("score", np.full(known.rows, math.nan))[known.best_iteration]
-        if row.get("kept_score", math.nan) >= 0.0:
-            score = row["kept_score"]
-        content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
-        # A full disk fails the run at its next checkpoint, not here.
-        with suppress(ResultsError):
-            replace_file(self._progress, json.dumps(content, default=float))
 
     def close(self, status: str, message: str) -> None:
         """Mark an unfinished run ``failed`` or ``stopped``, and keep its state in the partial file."""

@@ -24,10 +24,9 @@ SCHEMA_VERSION = 2
 STATUSES = ("running", "finished", "failed", "stopped")
 
 PARTIAL_SUFFIX = ".partial.h5"
-PROGRESS_SUFFIX = ".progress"
 REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"
-"""Suffixes of files of runs in progress, of their progress and replay buffers, and of archives."""
+"""Suffixes of files of runs in progress, of their replay buffers, and of archives."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 

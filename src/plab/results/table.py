@@ -16,11 +16,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import h5py
 import numpy as np
-import pandas as pd
 
 from plab.config.run import SUFFIX
 from plab.config.selection import lookup
@@ -45,6 +44,9 @@ from plab.results.schema import (
     stored_config,
 )
 from plab.results.schema import COLUMNS as ITERATION_COLUMNS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 T = TypeVar("T")
 
@@ -117,6 +119,8 @@ def load(
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
+    import pandas as pd
+
     found, unreadable = rows(source, index=index)
     warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
@@ -362,6 +366,7 @@ def _stored(place: Path) -> Index:
 def _write(place: Path, entries: Index) -> None:
     """Replace the index, if the folder is writable."""
     import duckdb
+    import pandas as pd
 
     table = [(name, *entry) for name, entry in entries.items()]
     temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")

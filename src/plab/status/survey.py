@@ -14,7 +14,7 @@ import pandas as pd
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.results import ResultsError, Row, row_count
-from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
+from plab.results.run_file import columns_of, opened, split_archive, summary_of
 from plab.results.running import held
 from plab.results.table import rows
 
@@ -168,8 +168,7 @@ def _measured(path: Path, total: int) -> Mapping[str, Any]:
     count = len(table.get("seconds", ()))
     if not count:
         return known
-    unit = "episodes" if "train_reward" in table else "rows"
-    done = table["episodes"] if unit == "episodes" else range(1, count + 1)
+    done = table["episodes"] if "train_reward" in table else range(1, count + 1)
     best = min(summary["best_iteration"], count - 1)
     known |= {"done": int(done[-1]), "score": float(table["score"][best])}
     if "kept_score" in table and table["kept_score"][-1] >= 0.0:
@@ -179,10 +178,6 @@ def _measured(path: Path, total: int) -> Mapping[str, Any]:
     if recent and known["done"] > int(done[-1 - recent]):
         rate = (known["done"] - int(done[-1 - recent])) / max(float(table["seconds"][-recent:].sum()), 1e-9)
         known |= {"left": max((total - known["done"]) / rate, 0.0), "rate": rate / together}
-    # Newer than the checkpoint.
-    latest = read_progress(path)
-    if latest.get("rows", 0) > count:
-        known |= {"done": int(latest[unit]), "score": latest["score"]}
     return known
 
 
