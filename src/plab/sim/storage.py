@@ -72,15 +72,12 @@ BASES = 8
 STRAINS = 56
 """Lane vectors per chunk for the intermediate results of one tile's material update; 54 are used."""
 
-STRAIN_D, STRAIN_W, STRAIN_Z, STRAIN_SCALARS = 9, 15, 21, 27
-STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 31, 37, 39, 48, 51
-"""Entries of a tile among these under von Mises plasticity, named as in :mod:`plab.laws.von_mises`: G is
-first; scalars are J, c2, a1, a2; bars those of J, c2; parameters mu, lambda and the yield strain, each with
-its adjoint."""
-
 LAW_PARAMETERS, LAW_PARAMETER_BARS, STRAIN_LAW = 0, 24, 54
-"""Entries of a tile among these under other laws: coefficients, their adjoints; and under any, the number of
-each lane's law where there are several."""
+"""Entries of a tile among these: the law's coefficients, their adjoints and, where there are several laws,
+the number of each lane's law."""
+
+STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 48, 51
+"""The same under von Mises plasticity; :mod:`plab.sim.codegen.materials` has the other entries."""
 
 GROUND = 4
 """Entries of an environment's material before the law's coefficients: floor friction, gravity (3)."""

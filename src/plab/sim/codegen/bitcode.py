@@ -130,7 +130,7 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
         return bytes(llvm.parse_assembly(text).as_bitcode())
     makers: Mapping[str, Maker]
     if isinstance(unit, Law):
-        makers = materials.tile_makers(unit, mixed) if device == "cpu" else materials.particle_makers(unit)
+        makers = materials.law_makers(unit, device, mixed)
     else:
         makers = stencils.TILE_TRANSFERS if device == "cpu" else stencils.PARTICLE_TRANSFERS
     module = ir.Module("plab")

@@ -25,16 +25,9 @@ from plab.sim.storage import (
     AT_F,
     LAW_PARAMETER_BARS,
     LAW_PARAMETERS,
-    STRAIN_BARS,
-    STRAIN_D,
-    STRAIN_D_BAR,
-    STRAIN_G_BAR,
     STRAIN_LAW,
     STRAIN_PARAMETER_BARS,
     STRAIN_PARAMETERS,
-    STRAIN_SCALARS,
-    STRAIN_W,
-    STRAIN_Z,
 )
 
 Maker = Callable[[ir.Module, str, ir.Type], None]
@@ -48,6 +41,32 @@ def scattered_matrix(tau: Sequence[Any], c: Sequence[Any], stress_scale: Any, ma
 # -- adjoints -----------------------------------------------------------------------------------------------
 
 
+def pulled_back(
+    function: Callable[..., tuple[Sequence[Any], Sequence[Any]]],
+    given: Sequence[Any],
+    fixed: Sequence[Any],
+    bars: Sequence[Any],
+    known: Sequence[Any] = (),
+) -> list[Any]:
+    """Return the adjoints of the numbers ``given`` from those of a function's results, ``bars``.
+
+    Args:
+        function: From the numbers given and those that are ``fixed``, two lists, to results and intermediate
+            results.
+        given: Numbers with adjoints.
+        fixed: Numbers without.
+        bars: Adjoints of the results.
+        known: Values of the intermediate results.
+    """
+    trace = Trace()
+    inputs, others = trace.inputs("given", len(given)), trace.inputs("fixed", len(fixed))
+    own = trace.inputs("bars", len(bars))
+    results, intermediate = function(inputs, others)
+    values = dict(zip([*inputs, *others, *own], [*given, *fixed, *bars], strict=True))
+    values |= dict(zip(intermediate, known, strict=True))
+    return evaluated(derivatives(results, own, inputs), values)
+
+
 def law_adjoint(
     law: Law,
     c: Sequence[Any],
@@ -57,20 +76,15 @@ def law_adjoint(
     a_bar: Sequence[Any],
     f_bar: Sequence[Any],
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return the adjoints of C (9), F (9) and the coefficients from those of A (9) and of the new F (9).
+    """Return the adjoints of C (9), F (9) and the coefficients from those of A (9) and of the new F (9);
+    ``constants`` are the time step, the scale of the stress in A, and the mass."""
 
-    ``constants`` are the time step, the scale of the stress in A, and the mass.
-    """
-    trace = Trace()
-    inputs = [*trace.inputs("c", 9), *trace.inputs("f", 9), *trace.inputs("p", len(parameters))]
-    dt, scale, mass = fixed = trace.inputs("constants", 3)
-    bars = [*trace.inputs("a_bar", 9), *trace.inputs("f_bar", 9)]
-    tau, f_new = law.update(inputs[:9], inputs[9:18], dt, *inputs[18:])
-    outputs = [*scattered_matrix(tau, inputs[:9], scale, mass), *f_new]
-    given = dict(
-        zip([*inputs, *fixed, *bars], [*c, *f, *parameters, *constants, *a_bar, *f_bar], strict=True)
-    )
-    out = evaluated(derivatives(outputs, bars, inputs), given)
+    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
+        dt, scale, mass = fixed
+        tau, f_new = law.update(x[:9], x[9:18], dt, *x[18:])
+        return [*scattered_matrix(tau, x[:9], scale, mass), *f_new], []
+
+    out = pulled_back(outputs, [*c, *f, *parameters], constants, [*a_bar, *f_bar])
     return out[:9], out[9:18], out[18:]
 
 
@@ -88,304 +102,146 @@ def stress_adjoint(
     c2: Any,
     parameters: Sequence[Any],
     a_bar: Sequence[Any],
-    stress_scale: Any,
-    series: algebra.Series,
+    scale: Any,
+    series: Any,
 ) -> tuple[list[Any], Any, Any, list[Any]]:
     """Return the contributions of the stress to the adjoints of d (6), c2, J and the parameters (3), from the
     adjoint of A (9)."""
-    trace = Trace()
-    inputs = [*trace.inputs("d", 6), *trace.inputs("scalars", 2), *trace.inputs("parameters", 3)]
-    bars, [scale] = trace.inputs("a_bar", 9), trace.inputs("scale", 1)
-    mu, lam, limit = inputs[8:]
-    tau = von_mises.stress(inputs[:6], inputs[7], inputs[6], mu, lam, limit, series)
-    a = scattered_matrix(tau, [0.0] * 9, scale, 0.0)
-    given = dict(zip([*inputs, *bars, scale], [*d, c2, j, *parameters, *a_bar, stress_scale], strict=True))
-    out = evaluated(derivatives(a, bars, inputs), given)
+
+    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
+        tau = von_mises.stress(x[:6], x[7], x[6], *x[8:], series)
+        return scattered_matrix(tau, [0.0] * 9, fixed[0], 0.0), []
+
+    out = pulled_back(outputs, [*d, c2, j, *parameters], [scale], a_bar)
     return out[:6], out[6], out[7], out[8:]
 
 
 def flow_adjoint(
-    d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: algebra.Series
+    d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: Any
 ) -> tuple[list[Any], list[Any], Any]:
     """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain, from the
     adjoint of the new F."""
-    trace = Trace()
-    inputs = [*trace.inputs("d", 6), *trace.inputs("g", 9), *trace.inputs("yield_strain", 1)]
-    bars = trace.inputs("f_bar", 9)
-    f = von_mises.flow(inputs[:6], inputs[6:15], inputs[15], series)
-    given = dict(zip([*inputs, *bars], [*d, *g, yield_strain, *f_bar], strict=True))
-    out = evaluated(derivatives(f, bars, inputs), given)
+
+    def outputs(x: Any, _fixed: Any) -> tuple[list[Any], list[Any]]:
+        return von_mises.flow(x[:6], x[6:15], x[15], series), []
+
+    out = pulled_back(outputs, [*d, *g, yield_strain], [], f_bar)
     return out[:6], out[6:15], out[15]
 
 
 def strain_adjoint(
-    c: Sequence[Any],
-    f: Sequence[Any],
-    dt: Any,
-    known: Sequence[Any],
-    bars: Sequence[Any],
-    series: algebra.Series,
+    c: Sequence[Any], f: Sequence[Any], dt: Any, known: Sequence[Any], bars: Sequence[Any], series: Any
 ) -> tuple[list[Any], list[Any]]:
-    """Return the contributions of the strain to the adjoints of C and F (9 each).
+    """Return the contributions of the strain to the adjoints of C and F (9 each), from those of G (9), J, c2
+    and d (6); ``known`` are G, J, c2, W (6), Z (6), a1, a2 and d, as computed from C and F."""
 
-    Args:
-        c: C.
-        f: F.
-        dt: Time step [s].
-        known: G (9), J, c2, W (6), Z (6), a1, a2 and d (6), as computed from C and F.
-        bars: Adjoints of G (9), J, c2 and d (6).
-        series: Numbers of terms.
-    """
-    trace = Trace()
-    inputs, [step] = trace.inputs("c", 9) + trace.inputs("f", 9), trace.inputs("dt", 1)
-    g = algebra.trial_gradient(inputs[:9], inputs[9:], step)
-    j = algebra.det(g)
-    c2, w, z, _z_squared, a1, a2, d = von_mises.hencky_strain(g, j, TracedSeries(*astuple(series)))
-    own = trace.inputs("bars", 17)
-    given = dict(zip([*inputs, step, *own], [*c, *f, dt, *bars], strict=True))
-    given |= dict(zip([*g, j, c2, *w, *z, a1, a2, *d], known, strict=True))
-    out = evaluated(derivatives([*g, j, c2, *d], own, inputs), given)
+    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
+        g = algebra.trial_gradient(x[:9], x[9:], fixed[0])
+        j = algebra.det(g)
+        c2, w, z, _z2, a1, a2, d = von_mises.hencky_strain(g, j, TracedSeries(*astuple(series)))
+        return [*g, j, c2, *d], [*g, j, c2, *w, *z, a1, a2, *d]
+
+    out = pulled_back(outputs, [*c, *f], [dt], bars, known)
     return out[:9], out[9:]
 
 
-# -- tiles --------------------------------------------------------------------------------------------------
+# -- tiles and particles -------------------------------------------------------------------------------------
+
+CONSTANTS = "dt stress_scale mass"
+"""Numbers of an update and its adjoint."""
+
+RANGE = "z_squared_max j_min j_max served"
+"""Range of the series, and whether it applies."""
 
 
-def series_of(real: ir.Type) -> algebra.Series:
-    """Return the series of a precision."""
-    return algebra.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
+TILE_PLACES = {
+    "c": ("source", AT_C, 9),
+    "f": ("source", AT_F, 9),
+    "a": ("affine", 0, 9),
+    "f_new": ("target", AT_F, 9),
+    "a_bar": ("affine", 0, 9),
+    "f_new_bar": ("bar", AT_F, 9),
+    "c_bar": ("bar", AT_C, 9),
+    "f_bar": ("bar", AT_F, 9),
+    # Under von Mises plasticity, named as in plab.laws.von_mises; scalars are J, c2, coefficients a1, a2.
+    "g": ("strains", 0, 9),
+    "d": ("strains", 9, 6),
+    "w": ("strains", 15, 6),
+    "z": ("strains", 21, 6),
+    "scalars": ("strains", 27, 2),
+    "coefficients": ("strains", 29, 2),
+    "d_bar": ("strains", 31, 6),
+    "scalar_bars": ("strains", 37, 2),
+    "g_bar": ("strains", 39, 9),
+    "limit_bar": ("strains", STRAIN_PARAMETER_BARS + 2, 1),
+}
+"""Array, first entry and number of each input and output of a tile's functions."""
 
-
-def in_series_range(one: Tile | Particle, j: Number, z_squared: Number) -> list[ir.Value]:
-    """Return the conditions for J and |Z|^2 to be in the range of the series."""
-    code = one.code
-    above = code.below(z_squared.value, one.number("z_squared_max").value, equal=True)
-    low = code.below(one.number("j_min").value, j.value, equal=True)
-    high = code.below(j.value, one.number("j_max").value, equal=True)
-    return [above, low, high]
+PARTICLE_PLACES = dict(
+    zip(("a", "f_new", "a_bar", "f_new_bar", "c_bar", "f_bar", "p_bar"), "cfabcfp", strict=True)
+)
+"""Vectors of a particle's inputs and outputs that have another name."""
 
 
 class Tile:
-    """Entries of a tile in a thread's working area ``strains``, and lane vectors at other addresses.
+    """A function of a tile of particles: lane vectors in a thread's working area ``strains`` and in arrays.
 
-    If bodies have different laws, only lanes with the law number ``own`` are written.
+    If bodies have different laws, only lanes with the law number ``own`` are written to arrays.
     """
 
     def __init__(
-        self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str, mixed: bool
+        self, law: Law, mixed: bool, addresses: str, numbers: str, module: ir.Module, name: str, real: ir.Type
     ) -> None:
+        """Begin a function of addresses and numbers."""
         self.code = Code(module, name, real, f"strains {addresses}", f"own {numbers}", grid=False)
         self.series = series_of(real)
-        self.own: ir.Value | None = None
+        scheduled = law is LAWS["von_mises"]
+        first = STRAIN_PARAMETERS if scheduled else LAW_PARAMETERS
+        bars = STRAIN_PARAMETER_BARS if scheduled else LAW_PARAMETER_BARS
+        self._places = TILE_PLACES | {
+            "p": ("strains", first, law.size),
+            "p_bar": ("strains", bars, law.size),
+        }
+        self._own: ir.Value | None = None
         if mixed:
-            law = self.take(STRAIN_LAW, 1)[0].value
-            self.own = self.code.equal(law, self.number("own").value)
+            held = self.code.lane_vector(self.code.args["strains"], STRAIN_LAW)
+            self._own = self.code.equal(held, self.number("own").value)
 
     def number(self, name: str) -> Number:
         """Return a number, the same for all lanes."""
         return Number(self.code, self.code.splat(self.code.args[name], LANE))
 
-    def take(self, first: int, count: int, name: str = "strains") -> list[Number]:
-        """Read consecutive lane vectors."""
-        place = self.code.args[name]
+    def take(self, name: str) -> list[Number]:
+        array, first, count = self._places[name]
+        place = self.code.args[array]
         return [Number(self.code, self.code.lane_vector(place, first + k)) for k in range(count)]
 
-    def leave(self, first: int, values: Sequence[Number | float], name: str = "strains") -> None:
-        """Write consecutive lane vectors; outside ``strains`` only in own lanes."""
-        place = self.code.args[name]
+    def leave(self, name: str, values: Sequence[Number | float]) -> None:
+        array, first, _count = self._places[name]
+        place = self.code.args[array]
         for k, one in enumerate(values):
             value = one.value if isinstance(one, Number) else self.code.constant(one)
-            if self.own is not None and name != "strains":
-                value = self.code.chosen(self.own, value, self.code.lane_vector(place, first + k))
+            if self._own is not None and array != "strains":
+                value = self.code.chosen(self._own, value, self.code.lane_vector(place, first + k))
             self.code.put_lane_vector(place, first + k, value)
 
-    def all_own(self, *conditions: ir.Value) -> ir.Value:
-        """Return 1 if all own lanes meet all conditions, else 0."""
-        if self.own is not None:
-            conditions = tuple(self.code.implied(self.own, one) for one in conditions)
-        return self.code.all_of(*conditions)
-
-    def strain(self) -> tuple[Any, ...]:
-        """Return C, G, J and the strain; record whether all lanes are in the range of the series."""
-        c, f = self.take(AT_C, 9, "source"), self.take(AT_F, 9, "source")
-        g = algebra.trial_gradient(c, f, self.number("dt"))
-        j = algebra.det(g)
-        found = von_mises.hencky_strain(g, j, self.series)
-        self.code.put("served", self.all_own(*in_series_range(self, j, found[3])))
-        return c, g, j, found
-
-    def parameters(self) -> list[Number]:
-        return self.take(STRAIN_PARAMETERS, 3)
+    def note(self, name: str, *conditions: ir.Value) -> None:
+        """Record 1 if all own lanes meet all conditions, else 0."""
+        if self._own is not None:
+            conditions = tuple(self.code.implied(self._own, one) for one in conditions)
+        self.code.put(name, self.code.all_of(*conditions))
 
     def note_yield(self, d: Sequence[Number], yield_strain: Number) -> None:
-        """Record whether any lane yields."""
-        _q, _det, _norm, k = von_mises.yield_factor(d, yield_strain)
-        rigid = self.code.below(self.code.constant(1.0), k.value, equal=True)
-        self.code.put("rigid", self.all_own(rigid))
-
-
-def tile_strain(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Strain of a tile with its state at ``source``: G, d, J and c2 to ``strains``."""
-    tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served", mixed)
-    _c, g, j, (c2, _w, _z, _z2, _a1, _a2, d) = tile.strain()
-    tile.leave(0, g)
-    tile.leave(STRAIN_D, d)
-    tile.leave(STRAIN_SCALARS, [j, c2])
-    tile.code.end()
-
-
-def tile_whole_strain(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """As :func:`tile_strain`, with the intermediate results for the adjoint."""
-    tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served", mixed)
-    _c, g, j, (c2, w, z, _z2, a1, a2, d) = tile.strain()
-    for first, values in ((0, g), (STRAIN_D, d), (STRAIN_W, w), (STRAIN_Z, z)):
-        tile.leave(first, values)
-    tile.leave(STRAIN_SCALARS, [j, c2, a1, a2])
-    tile.code.end()
-
-
-def tile_stress(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """A of a tile to ``affine``, from ``strains`` and C in the state at ``source``; ``rigid`` is 1 where
-    nothing yields."""
-    tile = Tile(module, name, real, "source affine", "stress_scale mass rigid", mixed)
-    d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
-    tau = von_mises.stress(d, j, c2, mu, lam, limit, tile.series)
-    c = tile.take(AT_C, 9, "source")
-    a = scattered_matrix(tau, c, tile.number("stress_scale"), tile.number("mass"))
-    tile.leave(0, a, "affine")
-    tile.note_yield(d, limit)
-    tile.code.end()
-
-
-def tile_flow(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """F of a tile after the substep to the state at ``target``."""
-    tile = Tile(module, name, real, "target", "", mixed)
-    f = von_mises.flow(tile.take(STRAIN_D, 6), tile.take(0, 9), tile.parameters()[2], tile.series)
-    tile.leave(AT_F, f, "target")
-    tile.code.end()
-
-
-def tile_rest(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """G of a tile as F after the substep to the state at ``target``."""
-    tile = Tile(module, name, real, "target", "", mixed)
-    tile.leave(AT_F, tile.take(0, 9), "target")
-    tile.code.end()
-
-
-def tile_stress_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoint of a tile's stress, from that of A in ``affine``; ``rigid`` is 1 where nothing yields."""
-    tile = Tile(module, name, real, "affine", "stress_scale rigid", mixed)
-    d, (j, c2), a_bar = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.take(0, 9, "affine")
-    parameters, scale = tile.parameters(), tile.number("stress_scale")
-    d_bar, c2_bar, j_bar, parameter_bars = stress_adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
-    tile.leave(STRAIN_D_BAR, d_bar)
-    tile.leave(STRAIN_BARS, [j_bar, c2_bar])
-    tile.leave(STRAIN_PARAMETER_BARS, parameter_bars)
-    tile.note_yield(d, parameters[2])
-    tile.code.end()
-
-
-def tile_flow_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoint of a tile's plastic flow, from that of the new F in ``bar``, added to that of the stress."""
-    tile = Tile(module, name, real, "bar", "", mixed)
-    d, g, f_bar = tile.take(STRAIN_D, 6), tile.take(0, 9), tile.take(AT_F, 9, "bar")
-    d_bar, g_bar, yield_bar = flow_adjoint(d, g, tile.parameters()[2], f_bar, tile.series)
-    tile.leave(STRAIN_D_BAR, [a + b for a, b in zip(tile.take(STRAIN_D_BAR, 6), d_bar, strict=True)])
-    tile.leave(STRAIN_G_BAR, g_bar)
-    tile.leave(STRAIN_PARAMETER_BARS + 2, [tile.take(STRAIN_PARAMETER_BARS + 2, 1)[0] + yield_bar])
-    tile.code.end()
-
-
-def tile_rest_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoint of G from that of the new F in ``bar``, where nothing yields."""
-    tile = Tile(module, name, real, "bar", "", mixed)
-    tile.leave(STRAIN_G_BAR, tile.take(AT_F, 9, "bar"))
-    tile.code.end()
-
-
-def tile_strain_adjoint(module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoints of C and F of a tile to ``bar``, from those of d, of the other inputs of the stress, and of
-    G."""
-    tile = Tile(module, name, real, "source affine bar", "dt mass", mixed)
-    c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
-    g, w, z, d = (tile.take(at, n) for at, n in ((0, 9), (STRAIN_W, 6), (STRAIN_Z, 6), (STRAIN_D, 6)))
-    known = [*g, *tile.take(STRAIN_SCALARS, 2), *w, *z, *tile.take(STRAIN_SCALARS + 2, 2), *d]
-    bars = [*tile.take(STRAIN_G_BAR, 9), *tile.take(STRAIN_BARS, 2), *tile.take(STRAIN_D_BAR, 6)]
-    c_bar, f_bar = strain_adjoint(c, f, tile.number("dt"), known, bars, tile.series)
-    mass, a_bar = tile.number("mass"), tile.take(0, 9, "affine")
-    tile.leave(AT_C, [one + mass * a for one, a in zip(c_bar, a_bar, strict=True)], "bar")
-    tile.leave(AT_F, f_bar, "bar")
-    tile.code.end()
-
-
-SCHEDULE = {
-    "strain": tile_strain,
-    "whole_strain": tile_whole_strain,
-    "stress": tile_stress,
-    "flow": tile_flow,
-    "rest": tile_rest,
-    "stress_adjoint": tile_stress_adjoint,
-    "flow_adjoint": tile_flow_adjoint,
-    "rest_adjoint": tile_rest_adjoint,
-    "strain_adjoint": tile_strain_adjoint,
-}
-"""Parts of the update under von Mises plasticity."""
-
-CONSTANTS = ("dt", "stress_scale", "mass")
-
-
-def tile_update(law: Law, keep: bool, module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """A of a tile to ``affine`` and, if ``keep``, F after the substep to the state at ``target``, from the
-    state at ``source``."""
-    tile = Tile(module, name, real, f"source affine{' target' * keep}", " ".join(CONSTANTS), mixed)
-    c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
-    dt, scale, mass = (tile.number(key) for key in CONSTANTS)
-    tau, f_new = law.update(c, f, dt, *tile.take(LAW_PARAMETERS, law.size))
-    tile.leave(0, scattered_matrix(tau, c, scale, mass), "affine")
-    if keep:
-        tile.leave(AT_F, f_new, "target")
-    tile.code.end()
-
-
-def tile_adjoint(law: Law, module: ir.Module, name: str, real: ir.Type, mixed: bool) -> None:
-    """Adjoints of C and F of a tile to ``bar``, from those of A in ``affine`` and of the new F in ``bar``,
-    and those of the coefficients to ``strains``."""
-    tile = Tile(module, name, real, "source affine bar", " ".join(CONSTANTS), mixed)
-    c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
-    constants = [tile.number(key) for key in CONSTANTS]
-    parameters = tile.take(LAW_PARAMETERS, law.size)
-    a_bar, f_bar = tile.take(0, 9, "affine"), tile.take(AT_F, 9, "bar")
-    c_out, f_out, bars = law_adjoint(law, c, f, parameters, constants, a_bar, f_bar)
-    tile.leave(AT_C, c_out, "bar")
-    tile.leave(AT_F, f_out, "bar")
-    tile.leave(LAW_PARAMETER_BARS, bars)
-    tile.code.end()
-
-
-def tile_makers(law: Law, mixed: bool) -> dict[str, Maker]:
-    """Return the writers of a law's functions of tiles, by name."""
-    makers: dict[str, Callable[..., None]] = {
-        "update": partial(tile_update, law, True),
-        "stress_only": partial(tile_update, law, False),
-        "adjoint": partial(tile_adjoint, law),
-    }
-    if law is LAWS["von_mises"]:
-        makers = dict(SCHEDULE)
-    return {name: partial(_with_kind, maker, mixed) for name, maker in makers.items()}
-
-
-def _with_kind(maker: Callable[..., None], mixed: bool, module: ir.Module, name: str, real: ir.Type) -> None:
-    maker(module, name, real, mixed)
-
-
-# -- particles ----------------------------------------------------------------------------------------------
+        """Record in ``rigid`` whether no lane yields."""
+        factor = von_mises.yield_factor(d, yield_strain)[3]
+        self.note("rigid", self.code.below(self.code.constant(1.0), factor.value, equal=True))
 
 
 class Particle:
-    """Numbers of a particle, read from and written to local variables of the caller."""
+    """A function of a particle: numbers read from and written to local variables of the caller."""
 
     def __init__(
-        self, module: ir.Module, name: str, real: ir.Type, vectors: str, numbers: str = "", grids: str = ""
+        self, vectors: str, numbers: str, module: ir.Module, name: str, real: ir.Type, grids: str = ""
     ) -> None:
         """Begin a function of grid addresses and nodes per axis, vectors (named with their lengths, such as
         ``c9``), and numbers."""
@@ -398,21 +254,13 @@ class Particle:
         return Number(self.code, self.code.args[name])
 
     def take(self, name: str) -> list[Number]:
-        return [self.number(f"{name}{k}") for k in range(self.lengths[name])]
+        own = PARTICLE_PLACES.get(name, name)
+        return [self.number(f"{own}{k}") for k in range(self.lengths[own])]
 
     def leave(self, name: str, values: Sequence[Number | float]) -> None:
         for k, one in enumerate(values):
             value = one.value if isinstance(one, Number) else self.code.constant(one)
-            self.code.put(f"{name}{k}", value)
-
-    def strain(self, c: Sequence[Number], f: Sequence[Number]) -> tuple[Any, ...]:
-        """Return G, J, the strain and whether it is in the range of the series, which is also recorded."""
-        g = algebra.trial_gradient(c, f, self.number("dt"))
-        j = algebra.det(g)
-        found = von_mises.hencky_strain(g, j, self.series)
-        fits = self.code.all_of(*in_series_range(self, j, found[3]))
-        self.code.put("served", self.code.flag(fits))
-        return g, j, found, fits
+            self.code.put(f"{PARTICLE_PLACES.get(name, name)}{k}", value)
 
     def is_yielding(self, d: Sequence[Number], limit: Number) -> ir.Value:
         """Return whether the factor of return mapping is below 1."""
@@ -420,32 +268,142 @@ class Particle:
         return self.code.below(factor.value, self.code.constant(1.0))
 
 
-RANGE = "z_squared_max j_min j_max served"
-"""Range of the series, and whether it applies."""
+def series_of(real: ir.Type) -> algebra.Series:
+    """Return the series of a precision."""
+    return algebra.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
 
 
-def scheduled_particle(module: ir.Module, name: str, real: ir.Type) -> None:
+def update(law: Law, keep: bool, one: Tile | Particle) -> None:
+    """A and, if ``keep``, F after the substep."""
+    c, f = one.take("c"), one.take("f")
+    dt, scale, mass = (one.number(key) for key in CONSTANTS.split())
+    tau, f_new = law.update(c, f, dt, *one.take("p"))
+    one.leave("a", scattered_matrix(tau, c, scale, mass))
+    if keep:
+        one.leave("f_new", f_new)
+
+
+def adjoint(law: Law, one: Tile | Particle) -> None:
+    """Adjoints of C, F and the coefficients, from those of A and of the new F."""
+    c, f = one.take("c"), one.take("f")
+    constants = [one.number(key) for key in CONSTANTS.split()]
+    given = c, f, one.take("p"), constants, one.take("a_bar"), one.take("f_new_bar")
+    for key, values in zip(("c_bar", "f_bar", "p_bar"), law_adjoint(law, *given), strict=True):
+        one.leave(key, values)
+
+
+# -- von Mises plasticity ------------------------------------------------------------------------------------
+
+
+def strain(one: Tile | Particle) -> tuple[Any, ...]:
+    """Return G, J, the strain, and the conditions for J and |Z|^2 to be in the range of the series."""
+    g = algebra.trial_gradient(one.take("c"), one.take("f"), one.number("dt"))
+    j = algebra.det(g)
+    found, code = von_mises.hencky_strain(g, j, one.series), one.code
+    above = code.below(found[3].value, one.number("z_squared_max").value, equal=True)
+    low = code.below(one.number("j_min").value, j.value, equal=True)
+    high = code.below(j.value, one.number("j_max").value, equal=True)
+    return g, j, found, (above, low, high)
+
+
+def tile_strain(whole: bool, tile: Tile) -> None:
+    """Strain of a tile; if ``whole``, with the intermediate results for the adjoint."""
+    g, j, (c2, w, z, _z2, a1, a2, d), fits = strain(tile)
+    tile.note("served", *fits)
+    tile.leave("g", g)
+    tile.leave("d", d)
+    if whole:
+        tile.leave("w", w)
+        tile.leave("z", z)
+    tile.leave("scalars", [j, c2])
+    if whole:
+        tile.leave("coefficients", [a1, a2])
+
+
+def tile_stress(tile: Tile) -> None:
+    """A of a tile, from its strain and C; ``rigid`` is 1 where nothing yields."""
+    d, (j, c2), (mu, lam, limit) = tile.take("d"), tile.take("scalars"), tile.take("p")
+    tau = von_mises.stress(d, j, c2, mu, lam, limit, tile.series)
+    tile.leave("a", scattered_matrix(tau, tile.take("c"), tile.number("stress_scale"), tile.number("mass")))
+    tile.note_yield(d, limit)
+
+
+def tile_flow(tile: Tile) -> None:
+    """F of a tile after the substep."""
+    tile.leave("f_new", von_mises.flow(tile.take("d"), tile.take("g"), tile.take("p")[2], tile.series))
+
+
+def tile_stress_adjoint(tile: Tile) -> None:
+    """Adjoint of a tile's stress, from that of A; ``rigid`` is 1 where nothing yields."""
+    d, (j, c2), a_bar = tile.take("d"), tile.take("scalars"), tile.take("a_bar")
+    parameters, scale = tile.take("p"), tile.number("stress_scale")
+    d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
+    for key, values in (("d_bar", d_bar), ("scalar_bars", [j_bar, c2_bar]), ("p_bar", bars)):
+        tile.leave(key, values)
+    tile.note_yield(d, parameters[2])
+
+
+def tile_flow_adjoint(tile: Tile) -> None:
+    """Adjoint of a tile's plastic flow, from that of the new F, added to that of the stress."""
+    d, g, f_bar = tile.take("d"), tile.take("g"), tile.take("f_new_bar")
+    d_bar, g_bar, limit_bar = flow_adjoint(d, g, tile.take("p")[2], f_bar, tile.series)
+    tile.leave("d_bar", [a + b for a, b in zip(tile.take("d_bar"), d_bar, strict=True)])
+    tile.leave("g_bar", g_bar)
+    tile.leave("limit_bar", [tile.take("limit_bar")[0] + limit_bar])
+
+
+def tile_strain_adjoint(tile: Tile) -> None:
+    """Adjoints of C and F of a tile from those of d, of the other inputs of the stress, and of G."""
+    c, f, g, w, z, d = map(tile.take, ("c", "f", "g", "w", "z", "d"))
+    (j, c2), (a1, a2) = tile.take("scalars"), tile.take("coefficients")
+    bars = [*tile.take("g_bar"), *tile.take("scalar_bars"), *tile.take("d_bar")]
+    known = [*g, j, c2, *w, *z, a1, a2, *d]
+    c_bar, f_bar = strain_adjoint(c, f, tile.number("dt"), known, bars, tile.series)
+    mass, a_bar = tile.number("mass"), tile.take("a_bar")
+    tile.leave("c_bar", [one + mass * a for one, a in zip(c_bar, a_bar, strict=True)])
+    tile.leave("f_bar", f_bar)
+
+
+def copy(source: str, target: str, tile: Tile) -> None:
+    tile.leave(target, tile.take(source))
+
+
+SCHEDULE: dict[str, tuple[Callable[..., None], str, str]] = {
+    "strain": (partial(tile_strain, False), "source", f"dt {RANGE}"),
+    "whole_strain": (partial(tile_strain, True), "source", f"dt {RANGE}"),
+    "stress": (tile_stress, "source affine", "stress_scale mass rigid"),
+    "flow": (tile_flow, "target", ""),
+    "rest": (partial(copy, "g", "f_new"), "target", ""),
+    "stress_adjoint": (tile_stress_adjoint, "affine", "stress_scale rigid"),
+    "flow_adjoint": (tile_flow_adjoint, "bar", ""),
+    "rest_adjoint": (partial(copy, "f_new_bar", "g_bar"), "bar", ""),
+    "strain_adjoint": (tile_strain_adjoint, "source affine bar", "dt mass"),
+}
+"""Parts of the update of a tile: writer, addresses and numbers. Where nothing yields, ``rest`` replaces
+``flow``."""
+
+
+def particle(one: Particle) -> None:
     """A in C's place, and F after the substep in F's; unchanged outside the range of the series."""
-    one = Particle(module, name, real, "c9 f9 p3", f"{' '.join(CONSTANTS)} {RANGE}")
-    code, c, f, (mu, lam, limit) = one.code, one.take("c"), one.take("f"), one.take("p")
-    g, j, (c2, _w, _z, _z2, _a1, _a2, d), fits = one.strain(c, f)
-    with code.where(fits):
+    code, (mu, lam, limit) = one.code, one.take("p")
+    g, j, (c2, _w, _z, _z2, _a1, _a2, d), fits = strain(one)
+    served = code.all_of(*fits)
+    code.put("served", code.flag(served))
+    with code.where(served):
         tau = von_mises.stress(d, j, c2, mu, lam, limit, one.series)
-        one.leave("c", scattered_matrix(tau, c, one.number("stress_scale"), one.number("mass")))
-        one.leave("f", g)
+        one.leave("a", scattered_matrix(tau, one.take("c"), one.number("stress_scale"), one.number("mass")))
+        one.leave("f_new", g)
         with code.where(one.is_yielding(d, limit)):
-            one.leave("f", von_mises.flow(d, g, limit, one.series))
-    code.end()
+            one.leave("f_new", von_mises.flow(d, g, limit, one.series))
 
 
-def scheduled_particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
-    """Adjoints of C and F in their places, from those of A, ``a``, and of the new F, ``b``, and those of the
-    coefficients in theirs; unchanged outside the range of the series."""
-    one = Particle(module, name, real, "c9 f9 a9 b9 p3", f"{' '.join(CONSTANTS)} {RANGE}")
-    code, c, f, a_bar, g_bar = one.code, one.take("c"), one.take("f"), one.take("a"), one.take("b")
-    mu, lam, limit = one.take("p")
-    g, j, (c2, w, z, _z2, a1, a2, d), fits = one.strain(c, f)
-    with code.where(fits):
+def particle_adjoint(one: Particle) -> None:
+    """Adjoints in place of C, F and the coefficients; unchanged outside the range of the series."""
+    code, a_bar, g_bar, (mu, lam, limit) = one.code, *map(one.take, ("a_bar", "f_new_bar", "p"))
+    g, j, (c2, w, z, _z2, a1, a2, d), fits = strain(one)
+    served = code.all_of(*fits)
+    code.put("served", code.flag(served))
+    with code.where(served):
         scale = one.number("stress_scale")
         d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
         kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
@@ -455,41 +413,42 @@ def scheduled_particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> N
             code.set_variables(kept, [x.value for x in (*sums, *g_flow)])
         *d_bar, bars[2] = (Number(code, value) for value in code.values(kept[:7]))
         g_bar = [Number(code, value) for value in code.values(kept[7:])]
-        known = [*g, j, c2, *w, *z, a1, a2, *d]
-        own = [*g_bar, j_bar, c2_bar, *d_bar]
+        known, own = [*g, j, c2, *w, *z, a1, a2, *d], [*g_bar, j_bar, c2_bar, *d_bar]
+        c, f, mass = one.take("c"), one.take("f"), one.number("mass")
         c_out, f_out = strain_adjoint(c, f, one.number("dt"), known, own, one.series)
-        mass = one.number("mass")
-        one.leave("c", [x + mass * a for x, a in zip(c_out, a_bar, strict=True)])
-        one.leave("f", f_out)
-        one.leave("p", bars)
-    code.end()
+        one.leave("c_bar", [x + mass * a for x, a in zip(c_out, a_bar, strict=True)])
+        one.leave("f_bar", f_out)
+        one.leave("p_bar", bars)
 
 
-def particle(law: Law, module: ir.Module, name: str, real: ir.Type) -> None:
-    """A in C's place, and F after the substep in F's."""
-    one = Particle(module, name, real, f"c9 f9 p{law.size}", " ".join(CONSTANTS))
-    c, f = one.take("c"), one.take("f")
-    dt, scale, mass = (one.number(key) for key in CONSTANTS)
-    tau, f_new = law.update(c, f, dt, *one.take("p"))
-    one.leave("c", scattered_matrix(tau, c, scale, mass))
-    one.leave("f", f_new)
+# -- all functions -------------------------------------------------------------------------------------------
+
+
+def law_makers(law: Law, device: str, mixed: bool) -> dict[str, Maker]:
+    """Return the writers of a law's functions of tiles or particles, by name; with ``mixed``, lanes of a tile
+    may have different laws."""
+    scheduled = law is LAWS["von_mises"]
+    if device == "cpu":
+        parts = {
+            "update": (partial(update, law, True), "source affine target", CONSTANTS),
+            "stress_only": (partial(update, law, False), "source affine", CONSTANTS),
+            "adjoint": (partial(adjoint, law), "source affine bar", CONSTANTS),
+        }
+        tiles = {
+            name: (write, partial(Tile, law, mixed, addresses, numbers))
+            for name, (write, addresses, numbers) in (SCHEDULE if scheduled else parts).items()
+        }
+        return {name: partial(_made, *part) for name, part in tiles.items()}
+    numbers = f"{CONSTANTS} {RANGE}" if scheduled else CONSTANTS
+    forward = particle if scheduled else partial(update, law, True)
+    back = particle_adjoint if scheduled else partial(adjoint, law)
+    return {
+        "particle": partial(_made, forward, partial(Particle, f"c9 f9 p{law.size}", numbers)),
+        "particle_adjoint": partial(_made, back, partial(Particle, f"c9 f9 a9 b9 p{law.size}", numbers)),
+    }
+
+
+def _made(write: Callable[..., None], begin: Callable[..., Any], *function: Any) -> None:
+    one = begin(*function)
+    write(one)
     one.code.end()
-
-
-def particle_adjoint(law: Law, module: ir.Module, name: str, real: ir.Type) -> None:
-    """Adjoints of C and F in their places, from those of A, ``a``, and of the new F, ``b``, and those of the
-    coefficients in theirs."""
-    vectors = f"c9 f9 a9 b9 p{law.size}"
-    one = Particle(module, name, real, vectors, " ".join(CONSTANTS))
-    constants = [one.number(key) for key in CONSTANTS]
-    given = one.take("c"), one.take("f"), one.take("p"), constants, one.take("a"), one.take("b")
-    for key, values in zip("cfp", law_adjoint(law, *given), strict=True):
-        one.leave(key, values)
-    one.code.end()
-
-
-def particle_makers(law: Law) -> dict[str, Maker]:
-    """Return the writers of a law's functions of particles, by name."""
-    if law is LAWS["von_mises"]:
-        return {"particle": scheduled_particle, "particle_adjoint": scheduled_particle_adjoint}
-    return {"particle": partial(particle, law), "particle_adjoint": partial(particle_adjoint, law)}

@@ -189,7 +189,7 @@ def gather_sums(module: ir.Module, name: str, real: ir.Type) -> None:
     offset (0, 1, 2) along x, y and z, 3-vectors in ``m``, where p is the momentum's adjoint; and in ``t`` the
     sum of grad_f w (p . q + velocity . h), where ``q`` and ``h`` are affine fields of 4-vectors: value at the
     base node and increments along x, y, z. ``w`` are weights by node and axis, ``s`` their slopes."""
-    one = Particle(module, name, real, "w9 s9 q16 h16 m12 t3", grids="velocity momentum")
+    one = Particle("w9 s9 q16 h16 m12 t3", "", module, name, real, "velocity momentum")
     code, w, s = one.code, one.take("w"), one.take("s")
     q, h = (_rows(one.take(key)) for key in ("q", "h"))
     rows = [rows_of(code, code.args[key]) for key in ("momentum", "velocity")]
