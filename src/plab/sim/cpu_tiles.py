@@ -266,69 +266,51 @@ class TilePhases(ParticlePhases):
             self.strains[at + STRAIN_LAW] = p[self.coefficients]
 
     @ti.func
+    def law_places(self, state_at, source, last_at, last, entry9, at):
+        """Addresses that a law's functions take: the tile in ``strains``, in the state and in ``affine``, and
+        its first lane vector ``last`` in another array."""
+        first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
+        return [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(last_at, last, 0)]
+
+    @ti.func
     def material_tile(
         self, state: ti.template(), state_at, source, target, entry9, e, at, update: ti.template()
     ):
         """A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry ``at``;
         the new F is stored if ``update``."""
+        first, x, affine, new = self.law_places(state_at, source, state_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(number)):
-                    self.scheduled_tile(state, state_at, source, target, entry9, e, at, number, update)
+                if ti.static(not self.scheduled(number)):
+                    self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
+                    numbers = [number, self.dt, self.stress_scale, self.mass]
+                    if ti.static(update):
+                        self.call(number, "update", [first, x, affine, new], numbers)
+                    else:
+                        self.call(number, "stress_only", [first, x, affine], numbers)
+                elif self.strain_tile(first, x, e, entry9, at, number, "strain"):
+                    # In parts; the new F is computed last.
+                    numbers = [number, self.stress_scale, self.mass]
+                    rigid = self.ask(number, "stress", [first, x, affine], numbers)
+                    if ti.static(update):
+                        if rigid < 1.0:
+                            self.call(number, "flow", [first, new], [number])
+                        else:
+                            self.call(number, "rest", [first, new], [number])
                 else:
-                    self.law_tile(state_at, source, target, entry9, e, at, number, update)
+                    for lane in range(self.lanes):
+                        if self.is_own(entry9, lane, number):
+                            a = self.spectral_material(state, source, target, lane, e, update)
+                            for i in ti.static(range(9)):
+                                self.affine[entry9 + i][lane] = a[i]
 
     @ti.func
-    def law_tile(self, state_at, source, target, entry9, e, at, number: ti.template(), update: ti.template()):
-        self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
-        first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
-        affine = self.lane_in(self.affine, entry9, 0)
-        numbers = [number, self.dt, self.stress_scale, self.mass]
-        if ti.static(update):
-            self.call(number, "update", [first, x, affine, self.lane_of(state_at, target, 0)], numbers)
-        else:
-            self.call(number, "stress_only", [first, x, affine], numbers)
-
-    @ti.func
-    def strain_tile(self, state_at, source, e, entry9, at, number: ti.template(), kind: ti.template()):
+    def strain_tile(self, first, x, e, entry9, at, number: ti.template(), kind: ti.template()):
         """Write strain and parameters of a tile to ``strains``, with ``whole_strain`` also the intermediate
         results for the adjoint; return whether all lanes are in the range of the series."""
         self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
-        addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
         limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return self.ask(number, kind, addresses, limits) > 0.0
-
-    @ti.func
-    def scheduled_tile(
-        self,
-        state: ti.template(),
-        state_at,
-        source,
-        target,
-        entry9,
-        e,
-        at,
-        number: ti.template(),
-        update: ti.template(),
-    ):
-        """As :meth:`law_tile`, in parts; the new F is computed last."""
-        if self.strain_tile(state_at, source, e, entry9, at, number, "strain"):
-            first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
-            affine = self.lane_in(self.affine, entry9, 0)
-            numbers = [number, self.stress_scale, self.mass]
-            rigid = self.ask(number, "stress", [first, x, affine], numbers)
-            if ti.static(update):
-                addresses = [first, self.lane_of(state_at, target, 0)]
-                if rigid < 1.0:
-                    self.call(number, "flow", addresses, [number])
-                else:
-                    self.call(number, "rest", addresses, [number])
-        else:
-            for lane in range(self.lanes):
-                if self.is_own(entry9, lane, number):
-                    a = self.spectral_material(state, source, target, lane, e, update)
-                    for i in ti.static(range(9)):
-                        self.affine[entry9 + i][lane] = a[i]
+        return self.ask(number, kind, [first, x], limits) > 0.0
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
@@ -344,58 +326,33 @@ class TilePhases(ParticlePhases):
         self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
     ):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
+        first, x, affine, bars = self.law_places(state_at, source, bar_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(self.scheduled(number)):
-                    self.scheduled_tile_adjoint(
-                        state, state_at, source, bar, bar_at, target, entry9, e, at, number
-                    )
+                if ti.static(not self.scheduled(number)):
+                    size = ti.static(self.laws[number].size)
+                    self.put_parameters(e, entry9, at, LAW_PARAMETERS, size)
+                    numbers = [number, self.dt, self.stress_scale, self.mass]
+                    self.call(number, "adjoint", [first, x, affine, bars], numbers)
+                    if ti.static(self.full_gradient):
+                        self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, size, number)
+                elif self.strain_tile(first, x, e, entry9, at, number, "whole_strain"):
+                    rigid = self.ask(number, "stress_adjoint", [first, affine], [number, self.stress_scale])
+                    if rigid < 1.0:
+                        self.call(number, "flow_adjoint", [first, bars], [number])
+                    else:
+                        self.call(number, "rest_adjoint", [first, bars], [number])
+                    if ti.static(self.full_gradient):
+                        self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
+                    ends = [number, self.dt, self.mass]
+                    self.call(number, "strain_adjoint", [first, x, affine, bars], ends)
                 else:
-                    self.law_tile_adjoint(state_at, source, bar_at, target, entry9, e, at, number)
-
-    @ti.func
-    def law_tile_adjoint(self, state_at, source, bar_at, target, entry9, e, at, number: ti.template()):
-        self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
-        first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
-        addresses = [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)]
-        numbers = [number, self.dt, self.stress_scale, self.mass]
-        self.call(number, "adjoint", addresses, numbers)
-        if ti.static(self.full_gradient):
-            self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, self.laws[number].size, number)
-
-    @ti.func
-    def scheduled_tile_adjoint(
-        self,
-        state: ti.template(),
-        state_at,
-        source,
-        bar: ti.template(),
-        bar_at,
-        target,
-        entry9,
-        e,
-        at,
-        number: ti.template(),
-    ):
-        if self.strain_tile(state_at, source, e, entry9, at, number, "whole_strain"):
-            first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
-            affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
-            numbers = [number, self.stress_scale]
-            rigid = self.ask(number, "stress_adjoint", [first, affine], numbers)
-            if rigid < 1.0:
-                self.call(number, "flow_adjoint", [first, bars], [number])
-            else:
-                self.call(number, "rest_adjoint", [first, bars], [number])
-            if ti.static(self.full_gradient):
-                self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
-            ends = [number, self.dt, self.mass]
-            addresses = [first, x, affine, bars]
-            self.call(number, "strain_adjoint", addresses, ends)
-        else:
-            for lane in range(self.lanes):
-                if self.is_own(entry9, lane, number):
-                    a_bar = self.load(self.affine, entry9, lane, 9)
-                    self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, at // STRAINS)
+                    for lane in range(self.lanes):
+                        if self.is_own(entry9, lane, number):
+                            a_bar = self.load(self.affine, entry9, lane, 9)
+                            self.spectral_material_adjoint(
+                                state, source, bar, target, a_bar, lane, e, at // STRAINS
+                            )
 
     @ti.func
     def parameter_tile_adjoint(
