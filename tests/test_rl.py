@@ -72,7 +72,7 @@ OWN = [name for name in METHODS if name != "tqc"]
 RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3"))
 """A population: different in seed, material and scene."""
 
-STEPS = {"tqc": (sb3._Watch, "_on_step")}
+STEPS = {"tqc": (sb3.Sb3Training, "_note")}
 """Step of training outside populations."""
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])

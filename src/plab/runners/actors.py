@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -80,23 +80,21 @@ class ActorTraining(Training):
         broken: Times and reasons of the episodes that diverged since the last evaluation.
     """
 
-    round_episodes = 1, 1
+    round_episodes, steps = (1, 1), 0
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the configuration's seed determines the initial weights and all later random numbers."""
         from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-        (cfg,) = cfgs
-        method: Any = cfg.method
+        (cfg,), method = cfgs, cast(Any, cfgs[0].method)
         super().__init__(cfgs, batch, self.round_episodes[0] * batch.size * batch.horizon)
-        self._cfg, self._method = cfg, method
+        self._cfg, self._method, self._spaces = cfg, method, Spaces.of(batch)
         self._device = torch.device(method.torch_device)
-        self._spaces = Spaces.of(batch)
         self.network: Any = first_policy(method, self._spaces, cfg.seed).to(self._device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), lr=method.lr)
         self._generator = torch.Generator(self._device).manual_seed(cfg.seed)
         self.statistics = RunningMeanStd(shape=self._spaces.observation_space.shape)
-        self._steps = self._evaluated = 0
+        self._evaluated = 0
         self.broken: list[str] = []
         self._measured: dict[str, list[float]] = {}
 
@@ -115,13 +113,9 @@ class ActorTraining(Training):
         """Return the initial policy, on the CPU."""
         return actor_policy(spaces, method.hidden)
 
-    @property
-    def steps(self) -> int:
-        return self._steps
-
     def cycle(self) -> None:
         self.learn(1.0 - self.steps / self.total_steps)
-        self._steps += self.round_episodes[0] * self.batch.size * self._horizon
+        self.steps += self._cycle_steps
         self.report()
 
     @abstractmethod
@@ -187,7 +181,7 @@ class ActorTraining(Training):
         self.statistics.mean, self.statistics.var = mean.numpy(), var.numpy()
         self.statistics.count = float(count)
         self._generator.set_state(state["generator"])
-        self._steps, self._evaluated = state["steps"], state["steps"] // self._horizon
+        self.steps, self._evaluated = state["steps"], state["steps"] // self._horizon
 
 
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:

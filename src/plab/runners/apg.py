@@ -55,13 +55,11 @@ class ApgRunner(Runner):
         """Create network and optimiser, with torch's default initial weights, or restore them from the
         file."""
         entries, action_dim = Spaces.of(self._episode).sizes
-        widths, layers = [entries, *self.method.hidden], list[torch.nn.Module]()
+        widths = itertools.pairwise([entries, *self.method.hidden, action_dim])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(track.cfg.seed)
-            for inputs, outputs in itertools.pairwise(widths):
-                layers += [torch.nn.Linear(inputs, outputs), torch.nn.ReLU()]
-            layers += [torch.nn.Linear(widths[-1], action_dim), torch.nn.Tanh()]
-        self._policy = torch.nn.Sequential(*layers).to(track.cfg.sim.device)
+            layers = [layer for pair in widths for layer in (torch.nn.Linear(*pair), torch.nn.ReLU())]
+        self._policy = torch.nn.Sequential(*layers[:-1], torch.nn.Tanh()).to(track.cfg.sim.device)
         self._optimizer = torch.optim.Adam(self._policy.parameters(), lr=self.method.lr)
         if state is not None:
             known = unpacked(state["torch"])

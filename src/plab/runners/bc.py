@@ -88,8 +88,8 @@ class Cloning(Imitation):
         """Begin with the observations and actions of the dataset."""
         super().__init__(cfgs, batch)
         data = pairs(self._method, self._spaces)
-        self.provenance["dataset_rows"] = len(data[0])
-        self.total_steps = whole_cycles(self._method.episodes * batch.horizon, len(data[0]))
+        self.provenance["dataset_rows"] = self._cycle_steps = len(data[0])
+        self.total_steps = whole_cycles(self._method.episodes * batch.horizon, self._cycle_steps)
         self.statistics.update(data[0].astype(np.float64))
         self.freeze_moments()
         seen, self._wanted = (torch.as_tensor(part, device=self._device) for part in data)
@@ -98,12 +98,6 @@ class Cloning(Imitation):
     @classmethod
     def environments(cls, cfg: Config) -> list[Config]:
         return []
-
-    def cycle(self) -> None:
-        """Pass over the data once."""
-        self.learn(1.0 - self.steps / self.total_steps)
-        self._steps += len(self._seen)
-        self.report()
 
     def learn(self, rate_left: float) -> None:
         """Make one pass over the data, at a fraction of the learning rate."""

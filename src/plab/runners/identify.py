@@ -72,28 +72,21 @@ class IdentifyRunner(Runner):
         """Read the episode, and make an environment per change of a parameter."""
         from plab.demonstrations.minari import read_episodes
 
-        (track,) = self.tracks
-        method = self.method
+        (track,), method = self.tracks, self.method
         self.problem = shared_problem(self.cache, [track.cfg] * (2 * len(method.parameters) + 1))
         scene, episodes = self.problem.scenes[0], list(read_episodes(method.dataset, method.episode + 1))
-        if method.episode >= len(episodes):
-            raise ConfigError(
-                f"method.episode={method.episode}: {method.dataset} has {len(episodes)} episodes"
-            )
+        if (count := len(episodes)) <= method.episode:
+            raise ConfigError(f"method.episode={method.episode}: {method.dataset} has {count} episodes")
         self._actions, seen = episodes[-1].actions.astype(np.float64), episodes[-1].observations
         if isinstance(seen, dict):
-            seen = seen["particles"] if "particles" in seen else seen.get("state", np.empty((0, 0)))
+            seen = seen.get("particles", seen.get("state", np.empty((0, 0))))
         least = track.cfg.observe_particles if seen.ndim == 2 else scene.particle_count
         self._stride = max(scene.particle_count // least, 1)
         count = len(range(0, scene.particle_count, self._stride))
-        if (
-            self._actions.shape != (scene.horizon, scene.action_dim)
-            or seen.reshape(len(seen), -1).shape[1] < 3 * count
-        ):
-            raise ConfigError(
-                f"method.dataset={method.dataset} is of another scene or observation: use its task, sim and "
-                "observe_particles"
-            )
+        shape, wanted = self._actions.shape, (scene.horizon, scene.action_dim)
+        if shape != wanted or seen.reshape(len(seen), -1).shape[1] < 3 * count:
+            why = "is of another scene or observation: use its task, sim and observe_particles"
+            raise ConfigError(f"method.dataset={method.dataset} {why}")
         rows = seen if seen.ndim == 3 else seen[:, : 6 * count].reshape(len(seen), count, 6)
         self._observed = rows[1:, :, :3].astype(np.float64)
 
@@ -102,10 +95,10 @@ class IdentifyRunner(Runner):
         first = [_value(self.problem.scenes[0], name) for name in self.method.parameters]
         if min(first) <= 0.0:
             raise ConfigError("fitted parameters must be positive initially")
-        logs = np.log(first)
-        nothing = np.zeros((len(logs), len(logs))), np.zeros(len(logs))
-        begin = {"trial": logs, "best": logs, "cost": np.inf, "damping": self.method.damping}
-        self._state: dict[str, Any] = begin | dict(zip(("curvature", "slope"), nothing, strict=True))
+        logs, count = np.log(first), len(first)
+        self._state: dict[str, Any] = {"trial": logs, "best": logs, "cost": np.inf}
+        linear = {"curvature": np.zeros((count, count)), "slope": np.zeros(count)}
+        self._state |= {"damping": self.method.damping} | linear
         if state is not None:
             self._state = {name: np.array(value) for name, value in state.items()}
 

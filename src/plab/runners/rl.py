@@ -59,16 +59,21 @@ class Population(Training):
 
         method = cfgs[0].method_as(RlConfig)
         kind = agents_of(method)
-        self._cycle_steps = kind.cycle_steps(method, batch.horizon)
-        super().__init__(cfgs, batch, self._cycle_steps)
+        super().__init__(cfgs, batch, kind.cycle_steps(method, batch.horizon))
         self._env, self._envs = TensorEnv(batch), method.num_envs
-        self._device = torch.device(method.torch_device)
+        self._device, cuda = torch.device(method.torch_device), method.torch_device == "cuda"
         spaces = Spaces.of(batch)
         if isinstance(method, OffPolicyConfig):
             sizes = Sizes(method.num_envs, batch.horizon, *spaces.sizes)
-            each = 4 * sizes.entries * sizes.capacity(method.buffer_size, self.total_steps)
-            _require_memory(len(cfgs), each, method.torch_device, cfgs[0].sim.memory_mb * 1e6)
-        size = len(cfgs) if self._device.type == "cuda" else 1
+            each = 4e-9 * sizes.entries * sizes.capacity(method.buffer_size, self.total_steps)
+            # The memory of the networks is negligible in comparison. One buffer is always tried on the CPU.
+            room = 0.9e-9 * torch.cuda.mem_get_info()[0] if cuda else max(cfgs[0].sim.memory_mb / 1e3, each)
+            if len(cfgs) * each > room:
+                raise RunError(
+                    f"no room for {len(cfgs)} replay buffers of {each:.1f} GB: {room:.1f} GB are free; set a "
+                    "smaller method.buffer_size or method.torch_device=cpu"
+                )
+        size = len(cfgs) if cuda else 1
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
         self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
         self._places = [(stack, number) for stack in self.stacks for number in range(stack.count)]
@@ -176,17 +181,6 @@ class Population(Training):
 
     def _split(self, table: Tensor) -> list[Tensor]:
         return list(table.split([stack.count for stack in self.stacks]))
-
-
-def _require_memory(count: int, each: float, device: str, memory: float) -> None:
-    """Raise RunError if the replay buffers do not fit into memory; one always fits on the CPU."""
-    # The memory of the networks is negligible in comparison.
-    room = 0.9 * torch.cuda.mem_get_info()[0] if device == "cuda" else max(memory, each)
-    if count * each > room:
-        raise RunError(
-            f"no room for {count} replay buffers of {each / 1e9:.1f} GB: {room / 1e9:.1f} GB are free; set a "
-            "smaller method.buffer_size or method.torch_device=cpu"
-        )
 
 
 class RlRunner(PolicyRunner):

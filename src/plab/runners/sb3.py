@@ -19,7 +19,7 @@ import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer as LibraryBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -89,8 +89,8 @@ class Sb3Training(Training):
         method: Any = cfg.method
         self._kind: ModelKind = family(method.family).rules[method.algorithm].what
         rollout = self._kind.rollout_steps
-        self._cycle_steps = method.num_envs * (batch.horizon if rollout is None else rollout(method))
-        super().__init__(cfgs, batch, self._cycle_steps)
+        steps = batch.horizon if rollout is None else rollout(method)
+        super().__init__(cfgs, batch, method.num_envs * steps)
         self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
         self._envs = PlabVecEnv(batch)
         self._envs.together = True
@@ -101,12 +101,8 @@ class Sb3Training(Training):
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
-        self._ended: list[Mapping[str, Any]] = []
-        self._watch = _Watch(self)
-        self._set_logger()
-
-    def _set_logger(self) -> None:
         self.model.set_logger(Logger(folder=None, output_formats=[]))
+        self._ended: list[Mapping[str, Any]] = []
 
     @property
     def steps(self) -> int:
@@ -114,15 +110,14 @@ class Sb3Training(Training):
 
     def cycle(self) -> None:
         # The library's log entries stay in its logger.
-        self.model.learn(
-            self._cycle_steps, callback=self._watch, log_interval=None, reset_num_timesteps=False
-        )
+        watch = ConvertCallback(lambda known, _: self._note(known["infos"]))
+        self.model.learn(self._cycle_steps, callback=watch, log_interval=None, reset_num_timesteps=False)
 
-    def note(self, infos: Sequence[Mapping[str, Any]]) -> None:
-        """Note the infos of a step of training."""
+    def _note(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
             self._ended += infos
             self.report()
+        return True
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
@@ -150,7 +145,7 @@ class Sb3Training(Training):
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
         # Episodes that were under way begin again.
         self.model = self._kind.model.load(io.BytesIO(state["model"].tobytes()), self._env, self._device)
-        self._set_logger()
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
         self._envs.next_episode = self.episodes // self._sizes.envs
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
@@ -210,15 +205,3 @@ class _Replay(LibraryBuffer):
         # After truncation the value of the next observation counts.
         ends = torch.zeros((batch_size, 1), device=self.device)
         return ReplayBufferSamples(observations[0], actions[0], after[0], ends, rewards[0][:, None])
-
-
-class _Watch(BaseCallback):
-    """Callback of every step of the training."""
-
-    def __init__(self, training: Sb3Training) -> None:
-        super().__init__()
-        self._training = training
-
-    def _on_step(self) -> bool:
-        self._training.note(self.locals["infos"])
-        return True

@@ -157,7 +157,7 @@ class Training(ABC):
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch, cycle: int) -> None:
         """Begin a training of ``method.episodes`` episodes, in cycles with the given number of transitions
         per policy."""
-        self.batch, self._horizon = batch, batch.horizon
+        self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
         self.total_steps = whole_cycles(cfgs[0].method_as(PolicyConfig).episodes * self._horizon, cycle)
         self.report = lambda: None
         self.provenance: dict[str, Any] = {}
