@@ -78,21 +78,20 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:
     """Let agents learn from scripts, and return the random numbers that they drew, in the order of use."""
     tapes: dict[str, list[Any]] = {"normal": [], "uniform": [], "integers": [], "permutation": []}
-    for kind, drawn in tapes.items():
-        original = getattr(agents.draws, kind)
+    original = agents.draws.draw
 
-        def draw(*shape: int, original: Any = original, drawn: list[Any] = drawn) -> torch.Tensor:
-            drawn.append(original(*shape))
-            return drawn[-1]
+    def draw(kind: str, *shape: int) -> torch.Tensor:
+        tapes[kind].append(original(kind, *shape))
+        return tapes[kind][-1]
 
-        setattr(agents.draws, kind, draw)
+    agents.draws.draw = draw
     play(agents, observations, rewards)
     return tapes
 
 
 def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
     """Let agents draw number by number, and learn from scripts."""
-    agents.draws.block = lambda use, draw, *shape: draw(*shape)
+    agents.draws.block = lambda use, kind, *shape: agents.draws.draw(kind, *shape)
     told = iter(torch.from_numpy(observations).to(agents.device).unbind(1))
     now = next(told)
     agents.begin(now)
@@ -220,11 +219,11 @@ def test_agents_learn_what_stable_baselines3_learns(name: str, monkeypatch) -> N
     """From the same first networks, observations, rewards and random numbers, over 27 updates and more."""
     scripts = make_scripts()
     agents, cfgs = learner(name)
-    first = [p.clone() for p in agents.networks.parameters()]
+    first = [p.clone() for p in agents.parameters()]
     with torch_settings(1):
         tapes = taped_and_played(agents, *scripts)
     assert agents.steps == STEPS * ENVS and agents.updates >= 4
-    assert all(not torch.equal(a, b) for a, b in zip(first, agents.networks.parameters(), strict=True))
+    assert all(not torch.equal(a, b) for a, b in zip(first, agents.parameters(), strict=True))
     for agent, (cfg, script) in enumerate(zip(cfgs, zip(*scripts, strict=True), strict=True)):
         model = library(cfg, *script)
         with monkeypatch.context() as patch, torch_settings(1):
@@ -234,8 +233,7 @@ def test_agents_learn_what_stable_baselines3_learns(name: str, monkeypatch) -> N
                 if hasattr(model.learning_rate, "remaining"):
                     model.learning_rate.remaining = 1.0 - done / agents.total_steps
                 model.learn(cycle, reset_num_timesteps=False)
-        own = library(cfg, *script).policy
-        agents.networks.write_to(own, agent)
+        own, _ = agents.policy(agent)
         for (key, expected), found in zip(model.policy.named_parameters(), own.parameters(), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-4, atol=2e-6, msg=key)
         if name == "sac":
@@ -249,14 +247,14 @@ def test_stacks_on_cuda_learn_what_those_on_the_cpu_learn(name: str) -> None:
     """From the same data and random numbers; updates are recorded after the third and replayed."""
     scripts = make_scripts()
     (agents, _), (others, _) = learner(name), learner(name, "cuda")
-    first = [p.detach().clone() for p in agents.networks.parameters()]
+    first = [p.detach().clone() for p in agents.parameters()]
     with torch_settings(1):
         played = {kind: deque(drawn) for kind, drawn in taped_and_played(agents, *scripts).items()}
         for kind, drawn in played.items():
             setattr(others.draws, kind, lambda *shape, drawn=drawn: drawn.popleft().cuda())
         play(others, *scripts)
-    after = [p.detach().cpu() for p in others.networks.parameters()]
-    pairs = list(zip(agents.networks.parameters(), after, strict=True))
+    after = [p.detach().cpu() for p in others.parameters()]
+    pairs = list(zip(agents.parameters(), after, strict=True))
     apart = max(float((a.detach() - b).abs().max()) for a, b in pairs)
     way = max(float((a - b).abs().max()) for a, b in zip(first, after, strict=True))
     assert (others.steps, others.updates) == (agents.steps, agents.updates)

@@ -396,7 +396,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
         intact(self, episodes)
         if self.episodes == 12:
             with torch.no_grad():
-                for parameter in self.stacks[-1].networks.parameters():
+                for parameter in self.stacks[-1].parameters():
                     parameter.fill_(np.nan)
 
     with monkeypatch.context() as patch:

@@ -87,30 +87,27 @@ class AgentRandom:
         self._device = device
         self._rest: dict[str, list[Tensor]] = {}
 
-    def _per_agent(self, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
-        return torch.stack([draw(generator) for generator in self._generators])
+    def draw(self, kind: str, *shape: int) -> Tensor:
+        """Draw numbers, shape [agent, *shape]: ``normal`` ones, ``uniform`` ones in [-1, 1), ``integers`` in
+        [0, :data:`LARGEST`), or a ``permutation`` of those below the only entry of ``shape``."""
+        drawn = []
+        for generator in self._generators:
+            options: dict[str, Any] = {"generator": generator, "device": self._device}
+            if kind == "normal":
+                drawn.append(torch.randn(shape, **options))
+            elif kind == "uniform":
+                drawn.append(torch.rand(shape, **options) * 2.0 - 1.0)
+            elif kind == "integers":
+                drawn.append(torch.randint(LARGEST, shape, **options))
+            else:
+                drawn.append(torch.randperm(*shape, **options))
+        return torch.stack(drawn)
 
-    def normal(self, *shape: int) -> Tensor:
-        """Standard normal numbers, shape [agent, ...]."""
-        return self._per_agent(lambda g: torch.randn(shape, generator=g, device=self._device))
-
-    def uniform(self, *shape: int) -> Tensor:
-        """Numbers uniform in [-1, 1), shape [agent, ...]."""
-        return self._per_agent(lambda g: torch.rand(shape, generator=g, device=self._device)) * 2.0 - 1.0
-
-    def integers(self, *shape: int) -> Tensor:
-        """Integers uniform in [0, :data:`LARGEST`), shape [agent, ...]."""
-        return self._per_agent(lambda g: torch.randint(LARGEST, shape, generator=g, device=self._device))
-
-    def permutation(self, count: int) -> Tensor:
-        """The numbers below ``count`` in random order, shape [agent, count]."""
-        return self._per_agent(lambda g: torch.randperm(count, generator=g, device=self._device))
-
-    def block(self, use: str, draw: Callable[..., Tensor], *shape: int) -> Tensor:
+    def block(self, use: str, kind: str, *shape: int) -> Tensor:
         """Return the next entry, shape [agent, *shape], of a named block of random numbers, which is refilled
         when used up."""
         if not self._rest.get(use):
-            self._rest[use] = list(draw(self.BLOCK, *shape).unbind(1))[::-1]
+            self._rest[use] = list(self.draw(kind, self.BLOCK, *shape).unbind(1))[::-1]
         return self._rest[use].pop()
 
     def states(self) -> list[np.ndarray]:
@@ -273,47 +270,26 @@ Part: TypeAlias = "dict[str, Tensor]"
 out], to avoid transposing products and gradients."""
 
 
-class Networks:
-    """The parameters of K policies of one kind, stacked; a part is a module, or several of the same shape.
+def stacked(
+    policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
+) -> dict[str, Part]:
+    """Return stacked parameters of policies of one kind by part: a module, or several of the same shape.
 
     Modules that are evaluated together, such as two critics, form one part; its stack has the modules of the
-    first agent, then those of the second, etc.
+    first policy, then those of the second, etc.
     """
-
-    def __init__(
-        self, policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
-    ) -> None:
-        """Stack copies of the policies' parameters; ``parts`` names the modules of each part in a policy."""
-        named = [dict(policy.named_parameters()) for policy in policies]
-        self._modules = {part: tuple(modules) for part, modules in parts.items()}
-        self._count = len(policies)
-        self.parts: dict[str, Part] = {}
-        for part, modules in parts.items():
-            # Of a module "a.b" the parameter "a.b.weight" is "weight", of a parameter "a" itself the name "".
-            names = [n[len(modules[0]) :] for n in named[0] if f"{n}.".startswith(f"{modules[0]}.")]
-            self.parts[part] = {
-                name.lstrip("."): torch.stack([_transposed(own[m + name]) for own in named for m in modules])
-                .to(device)
-                .requires_grad_()
-                for name in names
-            }
-
-    def __getitem__(self, part: str) -> Part:
-        return self.parts[part]
-
-    def parameters(self, *parts: str) -> list[Tensor]:
-        """Return the stacked parameters of some parts; of all if none is named."""
-        return [tensor for part in parts or self.parts for tensor in self.parts[part].values()]
-
-    def write_to(self, policy: nn.Module, agent: int) -> None:
-        """Copy the parameters of an agent to a policy."""
-        own = dict(policy.named_parameters())
-        with torch.no_grad():
-            for part, modules in self._modules.items():
-                for name, tensor in self.parts[part].items():
-                    rows = tensor.reshape(self._count, len(modules), *tensor.shape[1:])[agent]
-                    for module, row in zip(modules, rows, strict=True):
-                        own[f"{module}.{name}".rstrip(".")].copy_(_transposed(row))
+    named = [dict(policy.named_parameters()) for policy in policies]
+    stacks: dict[str, Part] = {}
+    for part, modules in parts.items():
+        # Of a module "a.b" the parameter "a.b.weight" is "weight", of a parameter "a" itself the name "".
+        names = [n[len(modules[0]) :] for n in named[0] if f"{n}.".startswith(f"{modules[0]}.")]
+        stacks[part] = {
+            name.lstrip("."): torch.stack([_transposed(own[m + name]) for own in named for m in modules])
+            .to(device)
+            .requires_grad_()
+            for name in names
+        }
+    return stacks
 
 
 def _transposed(parameter: Tensor) -> Tensor:
@@ -434,14 +410,14 @@ class Agents:
         sizes: Sizes of their episodes.
         steps: Number of transitions per agent so far.
         updates: Number of updates per agent so far.
-        networks: Their parameters.
+        networks: Their parameters by part.
         optimizers: Adam optimisers of parts of the networks, by name.
         tensors: Further tensors of a checkpoint, by name, each of shape [agent, ...].
         watched: Whether losses are recorded for :meth:`take_losses`.
     """
 
     PARTS: ClassVar[Mapping[str, Sequence[str]]]
-    """Modules of Stable-Baselines3's policy, by the parts of :class:`Networks`."""
+    """Modules of Stable-Baselines3's policy, by part; see :func:`stacked`."""
 
     LOSSES: ClassVar[Sequence[str]]
     """Names of the losses returned by an update, as in Stable-Baselines3's logs."""
@@ -460,7 +436,7 @@ class Agents:
         self.total_steps = whole_cycles(self.method.episodes * horizon, cycle)
         self.steps = self.updates = 0
         self.draws = AgentRandom([cfg.seed for cfg in cfgs], device)
-        self.networks = Networks(first, self.PARTS, device)
+        self.networks = stacked(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._updates: dict[str, CapturedUpdate] = {}
         self._losses: dict[str, list[Tensor]] = {}
@@ -473,9 +449,19 @@ class Agents:
     def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
         """Return Stable-Baselines3's policy with an agent's networks, and the scaling of its observations, if
         any."""
-        policy = first_policy(self.method, self._spaces)
-        self.networks.write_to(policy, agent)
+        policy: Any = first_policy(self.method, self._spaces)
+        own = dict(policy.named_parameters())
+        with torch.no_grad():
+            for part, modules in self.PARTS.items():
+                for name, tensor in self.networks[part].items():
+                    rows = tensor.reshape(self.count, len(modules), *tensor.shape[1:])[agent]
+                    for module, row in zip(modules, rows, strict=True):
+                        own[f"{module}.{name}".rstrip(".")].copy_(_transposed(row))
         return policy, None
+
+    def parameters(self, *parts: str) -> list[Tensor]:
+        """Return the stacked parameters of some parts; of all if none is named."""
+        return [tensor for part in parts or self.networks for tensor in self.networks[part].values()]
 
     @classmethod
     def cycle_steps(cls, method: Any, horizon: int) -> int:
@@ -502,7 +488,7 @@ class Agents:
 
     def _tables(self) -> dict[str, list[Tensor]]:
         """Return the stacked tensors with one row per agent, by their names in an agent's state."""
-        tables = {"networks": self.networks.parameters()}
+        tables = {"networks": self.parameters()}
         tables |= {name: [tensor] for name, tensor in self.tensors.items()}
         for name, optimizer in self.optimizers.items():
             kept = [optimizer.state[p] for p in optimizer.param_groups[0]["params"]]
@@ -575,18 +561,18 @@ class OffPolicyAgents(Agents):
         self._observations = observations
         if self.steps < self.method.learning_starts:
             shape = self.sizes.envs, self.sizes.actions
-            self._actions = self.explore_at_random(self.draws.block("start", self.draws.uniform, *shape))
+            self._actions = self.explore_at_random(self.draws.block("start", "uniform", *shape))
         else:
             self._actions = self._captured(self.explore, observations, self.noise()).clone()
         return self._actions
 
     def noise(self) -> Tensor:
         """Draw standard normal noise of the environments' actions, shape [agent, env, action]."""
-        return self.draws.block("noise", self.draws.normal, self.sizes.envs, self.sizes.actions)
+        return self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
 
     def numbers(self) -> Tensor:
         """Draw the numbers of an update's transitions, shape [agent, row]."""
-        return self.draws.block("numbers", self.draws.integers, self.method.batch_size)
+        return self.draws.block("numbers", "integers", self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Return the actions used before learning starts, given uniformly random ones."""

@@ -128,7 +128,7 @@ class PpoAgents(Agents):
         for name, kept in (("observation", self._seen), ("return", self._earned)):
             self.tensors |= {f"{name}_{part}": value for part, value in vars(kept).items()}
         self.tensors["returns"] = self._returns
-        parameters = self.networks.parameters()
+        parameters = self.parameters()
         self.optimizers = {"policy": adam(parameters, self.method.lr, eps=self.method.adam_eps)}
         rollout = agents, envs, self._length
         self.observations = torch.zeros((*rollout, self.sizes.observed), device=device)
@@ -172,7 +172,7 @@ class PpoAgents(Agents):
         with torch.no_grad():
             mean, values = self._evaluate(seen)
             std = self.networks["log_std"][""].exp().unsqueeze(1)
-            noise = self.draws.block("noise", self.draws.normal, self.sizes.envs, self.sizes.actions)
+            noise = self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
             actions = mean + std * noise
             self.observations[:, :, step], self.actions[:, :, step] = seen, actions
             self.rollout["values"][:, :, step] = values
@@ -205,7 +205,7 @@ class PpoAgents(Agents):
             self.judge(self._values(observations), self._over)
             rows = math.ceil(self._size / self.method.minibatches)
             for _ in range(self.method.epochs):
-                for numbers in self.draws.permutation(self._size).split(rows, dim=1):
+                for numbers in self.draws.draw("permutation", self._size).split(rows, dim=1):
                     self._note(self._captured(self.minibatch, numbers.contiguous()))
                 self.updates += 1
             self._over = []

@@ -52,12 +52,8 @@ class SacAgents(OffPolicyAgents):
         super().__init__(cfgs, spaces, device)
         self.log_ent_coef = torch.zeros(self.count, device=device, requires_grad=True)
         self.tensors["log_ent_coef"] = self.log_ent_coef
-        lr, networks = self.method.lr, self.networks
-        self.optimizers = {
-            "entropy": adam([self.log_ent_coef], lr),
-            "critics": adam(networks.parameters("critics"), lr),
-            "actor": adam(networks.parameters("actor"), lr),
-        }
+        own = {"entropy": [self.log_ent_coef]} | {n: self.parameters(n) for n in ("critics", "actor")}
+        self.optimizers = {name: adam(part, self.method.lr) for name, part in own.items()}
 
     @staticmethod
     def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
@@ -87,7 +83,7 @@ class SacAgents(OffPolicyAgents):
 
     def update(self) -> None:
         shape, numbers = (self.method.batch_size, self.sizes.actions), self.numbers()
-        noise = [self.draws.block(use, self.draws.normal, *shape) for use in ("actions", "next actions")]
+        noise = [self.draws.block(use, "normal", *shape) for use in ("actions", "next actions")]
         self._note(self._captured(self.descent, numbers, *noise))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
@@ -112,7 +108,7 @@ class SacAgents(OffPolicyAgents):
         least = twin_values(networks["critics"], observations, own_actions).min(1).values
         actor_loss = (ent_coef * log_prob - least).mean(1)
         descend(self.optimizers["actor"], actor_loss)
-        follow(networks.parameters("targets"), networks.parameters("critics"), self.method.tau)
+        follow(self.parameters("targets"), self.parameters("critics"), self.method.tau)
         losses = ent_coef.squeeze(1), entropy_loss, critic_loss, actor_loss
         return torch.stack([loss.detach() for loss in losses])
 

@@ -58,9 +58,7 @@ class Td3Agents(OffPolicyAgents):
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
         super().__init__(cfgs, spaces, device)
-        self.optimizers = {
-            part: adam(self.networks.parameters(part), self.method.lr) for part in ("critics", "actor")
-        }
+        self.optimizers = {part: adam(self.parameters(part), self.method.lr) for part in ("critics", "actor")}
 
     @staticmethod
     def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
@@ -87,7 +85,7 @@ class Td3Agents(OffPolicyAgents):
         delayed = self.updates % self.method.policy_delay != 0
         update, numbers = self.critics if delayed else self.both, self.numbers()
         shape = self.method.batch_size, self.sizes.actions
-        noise = self.draws.block("smoothing", self.draws.normal, *shape)
+        noise = self.draws.block("smoothing", "normal", *shape)
         self._note(self._captured(update, numbers, noise))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
@@ -103,7 +101,7 @@ class Td3Agents(OffPolicyAgents):
         actions = self._actor("actor", samples.observations)
         actor_loss = -twin_values(self.networks["critics"], samples.observations, actions)[:, 0].mean(1)
         descend(self.optimizers["actor"], actor_loss)
-        parameters = self.networks.parameters
+        parameters = self.parameters
         for target, source in (("targets", "critics"), ("actor_target", "actor")):
             follow(parameters(target), parameters(source), self.method.tau)
         return torch.stack([critic_loss, actor_loss.detach()])
