@@ -9,7 +9,7 @@ import pyvista as pv
 
 from plab.errors import ArgumentError
 from plab.render.camera import scene_camera
-from plab.render.shapes import body_meshes, manipulator_parts, pose_matrix, target_mesh
+from plab.render.shapes import body_meshes, floor_lines, manipulator_parts, pose_matrix, target_mesh
 from plab.scenes import Camera, Scene
 
 PAPER = "#f3f0ea"
@@ -37,7 +37,6 @@ _MOVING_OPACITY = 0.8  # of manipulators, in front of the plasticine that they m
 _GHOST_OPACITY = 0.35
 _NEAR = 0.01  # depth of the ghost below the target's surface, hidden where that is reached [domain units]
 _SHADOW = {"color": "#c5c0ba", "lighting": False}
-_FLOOR = np.linspace(0.0, 1.0, 11)  # its lines [domain units]
 
 
 class Renderer:
@@ -140,8 +139,7 @@ class Renderer:
             raise ArgumentError(f"poses have shape {np.shape(poses)}, not {(len(self._parts), 8)}")
         self._plotter.clear_actors()
         # Slightly above the floor, to be visible.
-        ends = [[x, 3e-3, z] for x in _FLOOR for z in (0.0, 1.0)]
-        lines = pv.line_segments_from_points(np.concatenate([ends, np.fliplr(ends)]))
+        lines = pv.line_segments_from_points(floor_lines(3e-3))
         look = {"opacity": 0.16, "line_width": 1.3, "lighting": False}
         self._plotter.add_mesh(lines, color=INK, reset_camera=False, **look)
         for number, (pose, own) in enumerate(zip(np.asarray(poses, np.float64), self._parts, strict=True)):

@@ -82,6 +82,12 @@ def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:
     return matrix
 
 
+def floor_lines(height: float) -> np.ndarray:
+    """Return the ends of the floor's grid lines, ten per domain unit, shape [2 * line, 3]."""
+    ends = [[x, height, z] for x in np.linspace(0.0, 1.0, 11) for z in (0.0, 1.0)]
+    return np.concatenate([ends, np.fliplr(ends)])
+
+
 def body_meshes(scene: Scene, x: np.ndarray) -> Iterator[pv.PolyData]:
     """Yield the surface of each body with particles at positions [domain units], shape [particle, 3]."""
     for number, body in enumerate(scene.bodies):

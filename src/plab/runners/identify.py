@@ -77,7 +77,8 @@ class IdentifyRunner(Runner):
         scene, episodes = self.problem.scenes[0], list(read_episodes(method.dataset, method.episode + 1))
         if (count := len(episodes)) <= method.episode:
             raise ConfigError(f"method.episode={method.episode}: {method.dataset} has {count} episodes")
-        self._actions, seen = episodes[-1].actions.astype(np.float64), episodes[-1].observations
+        self._actions = episodes[-1].actions.astype(np.float64)
+        seen: Any = episodes[-1].observations
         if isinstance(seen, dict):
             seen = seen.get("particles", seen.get("state", np.empty((0, 0))))
         least = track.cfg.observe_particles if seen.ndim == 2 else scene.particle_count

@@ -18,7 +18,7 @@ from jinja2 import Environment, StrictUndefined, Template
 from plab.render.camera import scene_camera
 from plab.render.renderer import BODY_COLORS, INK, MANIPULATOR_COLOR, PAPER, TARGET_COLOR
 from plab.render.rollouts import RecordedRollout
-from plab.render.shapes import body_mesh, manipulator_parts, pose_matrix, target_mesh
+from plab.render.shapes import body_mesh, floor_lines, manipulator_parts, pose_matrix, target_mesh
 
 _FRAMES = 60
 _POSITIONS = 600_000  # particles in all frames together: about 6 MB of the page
@@ -28,8 +28,7 @@ _STEPS_PER_SECOND = 10
 _ASPECT = 4 / 3  # aspect ratio for the camera; the page moves the camera back in narrower windows
 _GHOST_OPACITY = 0.3
 _OVERLAP = 1.2  # diameter of a particle, in mean particle spacings
-_FLOOR = np.linspace(0.0, 1.0, 11)  # where its lines are [domain units]
-_LINE = 0.0012  # their width [domain units]
+_LINE = 0.0012  # width of the floor's lines [domain units]
 _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt")
 
@@ -42,12 +41,8 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
 
     Args:
         recording: The rollout.
-        every: Environment steps between frames, with interpolated particles; default: at most 60
-            frames.
+        every: Environment steps between frames, with interpolated particles; default: at most 60 frames.
         surface: Show plasticine as smooth surfaces instead of its particles.
-
-    Returns:
-        HTML.
     """
     last = len(recording.x) - 1
     every = every or max(1, -(-last // _FRAMES))
@@ -65,8 +60,15 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         axes_helper=0,
         menu_visibility=False,
     )
-    bodies = _plasticine(recording, steps, surface=surface)
-    things = [*bodies, *_manipulators(recording, steps), *_target(recording), _floor()]
+    ends = floor_lines(0.0).astype(np.float32)
+    pairs = np.arange(len(ends), dtype=np.uint32).reshape(-1, 2)
+    look = {"color": _number(INK), "opacity": 0.2, "width": _LINE, "group": "floor"}
+    floor = k3d.lines(ends, pairs, indices_type="segment", **look)
+    things = [*_plasticine(recording, steps, surface=surface), *_manipulators(recording, steps), floor]
+    if mass is not None:
+        ghost = _mesh(target_mesh(scene, mass), TARGET_COLOR, "target")
+        ghost.opacity = _GHOST_OPACITY
+        things.append(ghost)
     for number, thing in enumerate(things, start=1):
         # Independent of memory addresses, so that the same rollout gives the same page.
         thing.id = number
@@ -136,28 +138,6 @@ def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[
             mesh = _mesh(part.mesh, MANIPULATOR_COLOR, "manipulators")
             mesh.model_matrix = {str(step): matrix for step, matrix in zip(steps, matrices, strict=True)}
             yield mesh
-
-
-def _target(recording: RecordedRollout) -> Iterator[Any]:
-    if recording.target_mass is not None:
-        mesh = _mesh(target_mesh(recording.scene, recording.target_mass), TARGET_COLOR, "target")
-        mesh.opacity = _GHOST_OPACITY
-        yield mesh
-
-
-def _floor() -> Any:
-    low, high = np.full_like(_FLOOR, _FLOOR[0]), np.full_like(_FLOOR, _FLOOR[-1])
-    along = np.stack([np.stack([low, _FLOOR], axis=-1), np.stack([high, _FLOOR], axis=-1)], axis=1)
-    ends = np.concatenate([along, along[..., ::-1]]).reshape(-1, 2)
-    return k3d.lines(
-        np.insert(ends, 1, 0.0, axis=1).astype(np.float32),
-        np.arange(len(ends), dtype=np.uint32).reshape(-1, 2),
-        indices_type="segment",
-        color=_number(INK),
-        opacity=0.2,
-        width=_LINE,
-        group="floor",
-    )
 
 
 def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
