@@ -16,7 +16,6 @@ from plab.errors import PlabError, tell
 from plab.report.page import asset, render
 from plab.report.statistics import BUDGETS
 from plab.results.run_file import replace_file
-from plab.scenes import PRECISIONS
 from plab.submissions.board import board
 from plab.submissions.collecting import from_policies, from_sources, submission_files
 from plab.submissions.submission import (
@@ -29,7 +28,7 @@ from plab.submissions.submission import (
     read,
     write,
 )
-from plab.submissions.verifying import TOLERANCE, Verification, write_verification
+from plab.submissions.verifying import HOLDS, TOLERANCE, write_verification
 from plab.submissions.verifying import verify as simulate_again
 from plab.targets.store import PHYSICS_VERSION
 
@@ -97,7 +96,7 @@ def _policy(text: str) -> tuple[str, Path]:
 
 @command_line
 def verify(argv: Sequence[str]) -> int:
-    """Simulate submissions again and print their scores, in float32 and in float64.
+    """Simulate submissions again and print their scores.
 
     plab verify mine.plabsub.zip
     plab verify submissions --run-policies sim.device=cuda
@@ -111,48 +110,35 @@ def verify(argv: Sequence[str]) -> int:
     parser.add_argument("arguments", nargs="+", help=what)
     what = "run the policies in the files: programs of other people, so do it where they can do no harm"
     parser.add_argument("--run-policies", action="store_true", help=what)
-    parser.add_argument("--float32", action="store_true", help="simulate in float32 only")
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.arguments, default=None)
     if not sources:
         parser.error("name a submission, or a folder of them")
-    precisions = PRECISIONS[:1] if options.float32 else PRECISIONS
-    codes = []
     if missing := [source for source in sources if not submission_files(source)]:
         raise SubmissionError(f"{missing[0]} has no submissions, files <name>{SUFFIX}")
+    codes = []
     for path in (path for source in sources for path in submission_files(source)):
         try:
             submission = read(path)
-            found = simulate_again(
-                submission, words, run_policies=options.run_policies, precisions=precisions
-            )
+            verdicts = simulate_again(submission, words, run_policies=options.run_policies)
         except PlabError as error:
             # An invalid file does not prevent the verification of others.
             tell(str(error))
             codes.append(error.exit_code)
             continue
-        _show(submission, found, precisions)
-        # One line suffices for a policy that was not run.
-        for why in dict.fromkeys(verdict.why for verdict in found.verdicts if verdict.why):
+        rows = [
+            (one.entry.configuration.name, one.entry.steps, one.entry.score, one.score, one.outcome)
+            for one in verdicts
+        ]
+        print_table(("configuration", "steps", "claimed", "score", "outcome"), rows, digits=4)
+        # One line suffices for policies that were not run.
+        for why in dict.fromkeys(one.why for one in verdicts if one.why):
             tell(f"{path}: {why}")
-        kept = write_verification(found, path)
-        good = sum(verdict.outcome == "holds" for verdict in found.verdicts)
-        print(f"{path}: {good} of {len(found.verdicts)} claim(s) hold; kept in {kept}")
-        codes.append(int(good < len(found.verdicts)))
+        kept = write_verification(verdicts, submission, words)
+        good = sum(one.outcome == HOLDS for one in verdicts)
+        print(f"{path}: {good} of {len(verdicts)} claim(s) hold; kept in {kept}")
+        codes.append(int(good < len(verdicts)))
     return max(codes)
-
-
-def _show(submission: Submission, verification: Verification, precisions: Sequence[str]) -> None:
-    name = submission.card.name if submission.card else "a recording"
-    print(f"{name}: {submission.track}, plab {submission.plab}, simulated by plab {plab.__version__}")
-    rows = []
-    for verdict in verification.verdicts:
-        entry, scores = verdict.entry, verdict.scores
-        numbers = [f"{scores[p]:.4f}" if p in scores else "" for p in precisions]
-        difference = f"{scores[precisions[0]] - entry.score:+.4f}" if scores else ""
-        claim = (entry.configuration.name, f"{entry.steps:,}", f"{entry.score:.4f}")
-        rows.append((*claim, *numbers, difference))
-    print_table(("configuration", "steps", "claimed", *precisions, "difference"), rows)
 
 
 @command_line

@@ -38,8 +38,8 @@ OWN = Card("", ("plab contributors",), "", budget=0, hardware="NVIDIA H200", gra
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 """Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
 
-Point: TypeAlias = tuple[str, str, int, float, float]
-"""Task, variant, environment steps, score in float32 and in float64 (NaN if unknown)."""
+Point: TypeAlias = tuple[str, str, int, float]
+"""Task, variant, environment steps, score."""
 
 
 _TABLES = {
@@ -102,11 +102,10 @@ def _line(
     Returns:
         ``card``; ``track`` (``plans`` or ``policies``); ``status`` (``verified``, ``claimed``, ``printed``,
         the paper's, or ``own runs``, plab's); ``covered``, number of configurations with a score; ``score``,
-        mean over all configurations of the table, missing ones counting as 0; ``exact``, the same in float64,
-        None if unknown; ``budgets``, the same within each budget, None without entries; ``tasks``, the same
-        by task, None without scores.
+        mean over all configurations of the table, missing ones counting as 0; ``budgets``, the same within
+        each budget, None without entries; ``tasks``, the same by task, None without scores.
     """
-    table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
+    table = pd.DataFrame(points, columns=["task", "variant", "steps", "score"])
     each = len(variants)
     expected = len(suite_tasks()) * each
 
@@ -123,7 +122,6 @@ def _line(
         "covered": len(whole),
         "budgets": [float(rows["score"].sum()) / expected if len(rows) else None for rows in within],
         "score": float(whole["score"].sum()) / expected,
-        "exact": None if whole["exact"].isna().any() else float(whole["exact"].sum()) / expected,
         "tasks": [tasks.get(task) for task in suite_tasks()],
     }
 
@@ -152,17 +150,19 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
         if entry.checksum != _known_checksum(entry.configuration, overrides):
             other = f"scene or target of {entry.configuration.name} is another one than on this leaderboard"
             raise SubmissionError(f"{path}: the {other}")
-    verification, status = read_verification(submission), "claimed"
-    if verification is not None:
-        if wrong := [v for v in verification.verdicts if v.outcome in (LIES, BROKE_OFF)]:
-            raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
-        status = "verified" if verification.outcomes == {HOLDS} else "claimed"
+    verdicts, status = read_verification(submission), "claimed"
+    if wrong := [one for one in verdicts if one.outcome in (LIES, BROKE_OFF)]:
+        raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
+    if verdicts and all(one.outcome == HOLDS for one in verdicts):
+        status = "verified"
     tables: dict[str, list[Point]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
-        scores = {} if verification is None else verification.verdicts[number].scores
-        own, score = entry.configuration, scores.get("float32", entry.score)
-        point = own.task, own.variant, entry.steps, score, scores.get("float64", math.nan)
-        tables["unseen" if own.variant in UNSEEN else "suite"].append(point)
+        own, score = entry.configuration, entry.score
+        if verdicts and not math.isnan(verdicts[number].score):
+            score = verdicts[number].score
+        tables["unseen" if own.variant in UNSEEN else "suite"].append(
+            (own.task, own.variant, entry.steps, score)
+        )
     for kind, points in tables.items():
         yield kind, _line(submission.card, submission.track, status, _TABLES[kind][-1], points)
 
@@ -182,7 +182,7 @@ def _runs(archive: str) -> dict[Card, list[Row]]:
 
 
 def _point(row: Row, steps: int, score: str) -> Point:
-    return row.values["task"], row.values["variant"], steps, row.values[score], math.nan
+    return row.values["task"], row.values["variant"], steps, row.values[score]
 
 
 def _paper() -> dict[str, Any]:
@@ -192,9 +192,7 @@ def _paper() -> dict[str, Any]:
         look = method(str(name))
         gradient = look.kind == GRADIENT
         card = replace(PAPER, name=look.label, gradient=gradient)
-        points = own[["task", "variant"]].assign(
-            steps=_PAPER_STEPS[gradient], score=own["iou_mean"], exact=math.nan
-        )
+        points = own[["task", "variant"]].assign(steps=_PAPER_STEPS[gradient], score=own["iou_mean"])
         track = "plans" if gradient else "policies"
         lines.append(_line(card, track, "printed", SUITE_VARIANTS, points.itertuples(index=False, name=None)))
     for card, runs in _runs("release").items():

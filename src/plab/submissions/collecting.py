@@ -223,7 +223,7 @@ def from_policies(
         except OSError as error:
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
         cfgs = [Configuration(task, variant).config(overrides) for variant in variants]
-        played = play(cfgs, load_policy(name, files[name]), "float32", str(path))
+        played = play(cfgs, load_policy(name, files[name]), str(path))
         for cfg, (score, failure) in zip(cfgs, played, strict=True):
             configuration = configuration_of(cfg)
             if failure:

@@ -1,4 +1,4 @@
-"""Verification of submissions by simulating all claims again, in float32 and in float64.
+"""Verification of submissions by simulating all claims again.
 
 Policies are TorchScript or ONNX. Loading a policy executes it, so this happens only on request.
 """
@@ -9,8 +9,8 @@ import io
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
@@ -22,15 +22,7 @@ from plab.config import Config
 from plab.envs.core import EpisodeBatch
 from plab.results.run_file import explained, replace_file
 from plab.results.running import now
-from plab.scenes import PRECISIONS
-from plab.submissions.submission import (
-    SUFFIX,
-    Configuration,
-    Entry,
-    Submission,
-    SubmissionError,
-    checksum,
-)
+from plab.submissions.submission import SUFFIX, Configuration, Entry, Submission, SubmissionError, checksum
 from plab.targets.store import PHYSICS_VERSION
 
 TOLERANCE = 0.02
@@ -52,77 +44,50 @@ class Verdict:
 
     Attributes:
         entry: The claim.
-        scores: Simulated score by precision; empty if it was not run.
+        score: Simulated score, NaN if it was not run or diverged.
         outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
         why: One-line reason, empty if it holds.
     """
 
     entry: Entry
-    scores: Mapping[str, float]
+    score: float
     outcome: str
     why: str = ""
 
 
-@dataclass(frozen=True)
-class Verification:
-    """Outcome of all claims of a file.
-
-    Attributes:
-        digest: SHA-256 of the submission, in hex.
-        verdicts: A verdict for each entry, in the order of the file.
-        overrides: Overrides of the simulation.
-    """
-
-    digest: str
-    verdicts: tuple[Verdict, ...]
-    overrides: tuple[str, ...]
-
-    @property
-    def outcomes(self) -> set[str]:
-        """Set of the outcomes of all entries."""
-        return {verdict.outcome for verdict in self.verdicts}
-
-
 def verify(
-    submission: Submission,
-    overrides: Sequence[str] = (),
-    *,
-    run_policies: bool = False,
-    precisions: Sequence[str] = PRECISIONS,
-) -> Verification:
-    """Simulate all entries of a submission again, with overrides such as ``sim.device=cuda``, in the given
-    precisions.
+    submission: Submission, overrides: Sequence[str] = (), *, run_policies: bool = False
+) -> list[Verdict]:
+    """Simulate all entries of a submission again, with overrides such as ``sim.device=cuda``.
 
     Its policies are programs from others, executed only with ``run_policies``.
+
+    Returns:
+        A verdict for each entry, in the order of the file.
 
     Raises:
         SubmissionError: If its physics, scenes or targets differ, or its plans or policies do not fit their
             tasks.
         plab.config.ConfigError: If an override is invalid.
     """
-    given = tuple(overrides)
-    cfgs = _configs(submission, given)
-    played: dict[int, dict[str, tuple[float, str]]] = defaultdict(dict)
+    cfgs = _configs(submission, overrides)
     # Each group fits into one simulator.
-    alike: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for number, entry in enumerate(submission.entries):
+    alike: dict[tuple[str, str], list[Entry]] = defaultdict(list)
+    for entry in submission.entries:
         if run_policies or not entry.policy:
-            alike[entry.configuration.task, entry.policy].append(number)
-    policies = {name: load_policy(name, submission.policies[name]) for _, name in alike if name}
-    # Changing the precision restarts Taichi.
-    for precision in precisions:
-        for (_, name), numbers in alike.items():
-            entries = [submission.entries[number] for number in numbers]
-            chosen = [cfgs[entry.configuration] for entry in entries]
-            plans = [entry.actions for entry in entries if entry.actions is not None]
-            actor = policies[name] if name else plans
-            for number, one in zip(numbers, play(chosen, actor, precision, name), strict=True):
-                played[number][precision] = one
-    verdicts = tuple(_verdict(entry, played[n]) for n, entry in enumerate(submission.entries))
-    return Verification(submission.digest, verdicts, given)
+            alike[entry.configuration.task, entry.policy].append(entry)
+    verdicts: dict[int, Verdict] = {}
+    for (_, name), entries in alike.items():
+        chosen = [cfgs[entry.configuration] for entry in entries]
+        plans = [entry.actions for entry in entries if entry.actions is not None]
+        actor = load_policy(name, submission.policies[name]) if name else plans
+        for entry, played in zip(entries, play(chosen, actor, name), strict=True):
+            verdicts[id(entry)] = _verdict(entry, *played)
+    why = "policies were not run; --run-policies runs them"
+    return [verdicts.get(id(one), Verdict(one, math.nan, NOT_RUN, why)) for one in submission.entries]
 
 
-def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
+def _configs(submission: Submission, overrides: Sequence[str]) -> dict[Configuration, Config]:
     """Compose all configurations, and reject those that differ from the submission's."""
     versions = f"({submission.plab}, this is {plab.__version__})"
     if submission.physics != PHYSICS_VERSION:
@@ -142,31 +107,26 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
     return found
 
 
-def _verdict(entry: Entry, played: Mapping[str, tuple[float, str]]) -> Verdict:
-    if not played:
-        return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
-    scores = {precision: score for precision, (score, _) in played.items()}
-    if broken := [f"{precision}: {failure}" for precision, (_, failure) in played.items() if failure]:
-        return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation diverged, {broken[0]}")
-    if min(abs(score - entry.score) for score in scores.values()) <= TOLERANCE:
-        return Verdict(entry, scores, HOLDS)
-    reached = ", ".join(f"{score:.4f} in {precision}" for precision, score in scores.items())
-    why = f"{entry.name}: claims {entry.score:.4f}, scores {reached} (tolerance {TOLERANCE})"
-    return Verdict(entry, scores, LIES, why)
+def _verdict(entry: Entry, score: float, failure: str) -> Verdict:
+    if failure:
+        return Verdict(entry, score, BROKE_OFF, f"{entry.name}: the simulation diverged, {failure}")
+    if abs(score - entry.score) <= TOLERANCE:
+        return Verdict(entry, score, HOLDS)
+    why = f"{entry.name}: claims {entry.score:.4f}, scores {score:.4f} (tolerance {TOLERANCE})"
+    return Verdict(entry, score, LIES, why)
 
 
 # ---------------------------------------------------------------------------------------------- simulation
 
 
 def play(
-    cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], precision: str, name: str = ""
+    cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], name: str = ""
 ) -> list[tuple[float, str]]:
     """Simulate plans or a policy in several configurations of one task, in the hard contact model.
 
     Args:
         cfgs: The configurations.
         actor: A plan, shape [T, A], for each configuration; or a policy.
-        precision: ``float32`` or ``float64``; observations are float32 in both.
         name: Name of the policy in messages.
 
     Returns:
@@ -179,15 +139,24 @@ def play(
     played: list[tuple[float, str]] = []
     for start in range(0, len(cfgs), _BATCH):
         some = cfgs[start : start + _BATCH]
-        batch = EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
+        batch = EpisodeBatch(some)
         observations, _ = batch.reset()
         (components,) = batch.action_space.shape or (0,)
         if callable(actor):
-            _check_policy(actor, observations, name, components)
+            actions = actor(observations)
+            if actions.shape[1] != components:
+                given = f"{name} gives actions of {actions.shape[1]} components"
+                raise SubmissionError(f"{given}, its task takes {components}")
+            if not np.array_equal(actions, actor(observations)):
+                raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
         else:
-            plans = _stacked(some, actor[start : start + _BATCH], [batch.horizon, components])
+            plans, shape = actor[start : start + _BATCH], (batch.horizon, components)
+            for cfg, plan in zip(some, plans, strict=True):
+                if plan.shape != shape:
+                    given = f"the plan has shape {list(plan.shape)}, its task takes {list(shape)}"
+                    raise SubmissionError(f"{cfg.task.name}-v{cfg.variant}: {given}")
         for t in range(batch.horizon):
-            actions = actor(observations) if callable(actor) else plans[:, t]
+            actions = actor(observations) if callable(actor) else np.stack([plan[t] for plan in plans])
             step = batch.step(actions, strict=False)
             observations = step.observation
         batch.close()
@@ -195,23 +164,6 @@ def play(
             failure = step.failures.get(n, "")
             played.append((math.nan if failure else float(score), failure))
     return played
-
-
-def _stacked(cfgs: Sequence[Config], plans: Sequence[np.ndarray], shape: list[int]) -> np.ndarray:
-    for cfg, plan in zip(cfgs, plans, strict=True):
-        if list(plan.shape) != shape:
-            where = f"{cfg.task.name}-v{cfg.variant}"
-            raise SubmissionError(f"{where}: the plan has shape {list(plan.shape)}, its task takes {shape}")
-    return np.stack(plans)
-
-
-def _check_policy(policy: Policy, observations: np.ndarray, name: str, components: int) -> None:
-    actions = policy(observations)
-    if actions.shape[1] != components:
-        given = f"{name} gives actions of {actions.shape[1]} components"
-        raise SubmissionError(f"{given}, its task takes {components}")
-    if not np.array_equal(actions, policy(observations)):
-        raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
 
 
 def load_policy(name: str, content: bytes) -> Policy:
@@ -235,10 +187,8 @@ def load_policy(name: str, content: bytes) -> Policy:
             actions = np.asarray(policy(observations), np.float64)
         except Exception as error:
             raise SubmissionError(f"{name} cannot be run ({_reason(error)})") from None
-        if actions.ndim != 2 or len(actions) != len(observations):
-            raise SubmissionError(f"{name} gives actions of shape {list(actions.shape)}, not [batch, action]")
-        if not np.isfinite(actions).all():
-            raise SubmissionError(f"{name} gives actions that are not finite")
+        if actions.ndim != 2 or len(actions) != len(observations) or not np.isfinite(actions).all():
+            raise SubmissionError(f"{name} must give finite actions of shape [batch, action]")
         return np.clip(actions, -1.0, 1.0)
 
     return answer
@@ -272,41 +222,42 @@ def _reason(error: Exception) -> str:
 # ------------------------------------------------------------------------------------------------------ files
 
 
-def verification_path(submission: Path) -> Path:
-    """Return the path of a submission's verification file."""
-    return submission.with_name(submission.name.removesuffix(SUFFIX) + ".verified.json")
+def _beside(submission: Submission) -> Path | None:
+    path = submission.path
+    return path and path.with_name(path.name.removesuffix(SUFFIX) + ".verified.json")
 
 
-def write_verification(verification: Verification, submission: Path) -> Path:
-    """Write the verification file of a submission; return its path.
+def write_verification(verdicts: Sequence[Verdict], submission: Submission, overrides: Sequence[str]) -> Path:
+    """Write the verification file beside a submission; return its path.
 
     Raises:
         plab.results.ResultsError: If it cannot be written.
     """
-    path = verification_path(submission)
-    verdicts = [
-        {"name": one.entry.name, "claimed": one.entry.score, "scores": one.scores}
+    path = _beside(submission)
+    assert path is not None
+    entries = [
+        {"name": one.entry.name, "claimed": one.entry.score, "score": one.score}
         | {"outcome": one.outcome, "why": one.why}
-        for one in verification.verdicts
+        for one in verdicts
     ]
-    record = {"submission": verification.digest, "plab": plab.__version__, "physics": PHYSICS_VERSION}
-    record |= {"overrides": list(verification.overrides), "tolerance": TOLERANCE, "time": now()}
-    replace_file(path, json.dumps(record | {"entries": verdicts}, indent=1) + "\n")
+    record = {"submission": submission.digest, "plab": plab.__version__, "physics": PHYSICS_VERSION}
+    record |= {"overrides": list(overrides), "tolerance": TOLERANCE, "time": now()}
+    replace_file(path, json.dumps(record | {"entries": entries}, indent=1) + "\n")
     return path
 
 
-def read_verification(submission: Submission) -> Verification | None:
-    """Return the verification of a submission; None if this file was not verified with the current physics.
+def read_verification(submission: Submission) -> list[Verdict]:
+    """Return the verdicts on a submission; empty if this file was not verified with the current physics.
 
     Raises:
         plab.results.ResultsError: If the verification file cannot be read.
     """
-    if submission.path is None or not (path := verification_path(submission.path)).exists():
-        return None
+    path = _beside(submission)
+    if path is None or not path.exists():
+        return []
     with explained(path):
         record = json.loads(path.read_bytes())
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
-            return None
+            return []
         pairs = zip(submission.entries, record["entries"], strict=True)
-        verdicts = tuple(Verdict(entry, own["scores"], own["outcome"], own["why"]) for entry, own in pairs)
-        return Verification(submission.digest, verdicts, tuple(record["overrides"]))
+        return [Verdict(entry, own["score"], own["outcome"], own["why"]) for entry, own in pairs]
