@@ -304,9 +304,9 @@ class Lock:
 
     def __init__(self, path: str | Path, timeout: float = _PATIENCE) -> None:
         """Acquire the lock of a run, as :func:`acquire` does; filelock.Timeout if it is held for longer."""
+        file, often = lock_path(path), _PATIENCE / 8
         # The soft lock of a killed process would never be released.
-        options = {"thread_local": False, "fallback_to_soft": False}
-        self._lock = FileLock(lock_path(path), timeout, poll_interval=_PATIENCE / 8, **options)
+        self._lock = FileLock(file, timeout, thread_local=False, poll_interval=often, fallback_to_soft=False)
         self._lock.acquire()
 
     def release(self) -> None:

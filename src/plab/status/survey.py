@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -155,7 +155,7 @@ def _described(row: Row, state: str) -> dict[str, Any]:
     return known | (_measured(row.path, total) if state == "running" else {})
 
 
-def _measured(path: Path, total: int) -> Mapping[str, Any]:
+def _measured(path: Path, total: int) -> dict[str, Any]:
     """Return progress, speed and time left of a run in progress, estimated from its latest rows."""
     try:
         with opened(path) as file:
