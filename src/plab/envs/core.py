@@ -6,6 +6,7 @@ the interface of each library.
 
 from __future__ import annotations
 
+import copy
 import functools
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -165,28 +166,22 @@ class EpisodeState:
     """State of a batch between two steps, see :meth:`EpisodeBatch.get_state`.
 
     Attributes:
-        steps: Steps taken in the episodes, shape [batch]; None before the first :meth:`EpisodeBatch.reset`.
         simulation: Particles and manipulators, shape [batch, ...] each.
-        failures: Diverged environments.
-        last: Observations, loss terms, IoU and, if requested, impulses of the last step.
-        seeds: Entropy of the environments' randomisation.
-        episodes: Numbers of the episodes, shape [batch].
-        over: Masks of the episodes that have ended by success or at the horizon, shape [batch].
+        episodes: Attributes of the batch that belong to its episodes, by name.
         values: Sampled parameters of each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
         stages: Numbers, accumulated rewards and scores of the stages; empty without stages.
     """
 
-    steps: np.ndarray | None
     simulation: State
-    failures: Mapping[int, str]
-    last: tuple[Any, ...]
-    seeds: tuple[tuple[int, ...], ...]
-    episodes: np.ndarray
-    over: np.ndarray
+    episodes: Mapping[str, Any]
     values: tuple[Values, ...]
     starts: np.ndarray
     stages: tuple[np.ndarray, ...] = ()
+
+
+_EPISODES = ("_steps", "failures", "_last", "_seeds", "_episodes", "_over")
+"""Attributes of a batch that belong to its episodes."""
 
 
 class EpisodeBatch:
@@ -198,6 +193,7 @@ class EpisodeBatch:
         size: Number of sub-environments.
         horizon: Steps of an episode.
         draws: Randomisation of the episodes.
+        failures: Diverged environments, with time and reason.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
         changed_by_hand: Whether the simulator was given other scenes, materials, targets or initial states.
@@ -327,7 +323,7 @@ class EpisodeBatch:
     def _observe_starts(self) -> None:
         """Measure and observe the current states of all environments as initial states."""
         self._changes = self._simulator.changes
-        self._failures: dict[int, str] = {}
+        self.failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
         measured = self._measured()
         self._initial = self._last = (self._observe(), *measured)
@@ -344,7 +340,7 @@ class EpisodeBatch:
     def over(self) -> np.ndarray:
         """Mask of the ended episodes, which need a reset, shape [batch]."""
         over = self._over.copy()
-        over[list(self._failures)] = True
+        over[list(self.failures)] = True
         return over
 
     @property
@@ -402,7 +398,7 @@ class EpisodeBatch:
         if self._steps is None:
             self._steps = np.zeros(self.size, int)
         self._steps[rows], self._over[rows] = 0, False
-        self._failures = {e: text for e, text in self._failures.items() if e not in rows}
+        self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
         if changed or self.draws.changed or environments is not None or on_device(like):
             measured = self._measured(like)
@@ -473,8 +469,8 @@ class EpisodeBatch:
             if strict:
                 raise
             # Raised once per step; the second call returns the measures of the others.
-            self._failures, measured = error.failures | self._failures, self._measured(actions)
-        self._update(observation, measured, kept=list(self._failures))
+            self.failures, measured = error.failures | self.failures, self._measured(actions)
+        self._update(observation, measured, kept=list(self.failures))
         observation, info = self._shown()
         reward = self._initial_loss.like(actions) - info["loss"]
         if self._stages:
@@ -483,7 +479,7 @@ class EpisodeBatch:
         terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
         self._over = terminated | truncated
-        done = Transition(observation, reward, terminated, truncated, info, dict(self._failures))
+        done = Transition(observation, reward, terminated, truncated, info, dict(self.failures))
         if self.listener is not None:
             self.listener(actions, done)
         return done
@@ -494,14 +490,14 @@ class EpisodeBatch:
         reward = reward + Constants(stages.earned.copy()).like(like)
         stages.note(_on_host(info["score"]))
         reached = _on_host(info["score"]) >= self._success_score
-        reached[list(self._failures)] = False
+        reached[list(self.failures)] = False
         rows = np.flatnonzero(reached & ~stages.last).tolist()
         if rows:
             stages.earned[rows] = _on_host(reward)[rows]
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
             measured = self._measured(like)
             self._note_starts(rows, *measured[:2])
-            self._update(self._observe(like), measured, kept=list(self._failures))
+            self._update(self._observe(like), measured, kept=list(self.failures))
         info |= self._stage_info(info["score"])
         return reward
 
@@ -518,22 +514,13 @@ class EpisodeBatch:
         """Return a copy of the state for :meth:`set_state`; on the CPU the continuation is bitwise
         reproducible."""
         simulation = self._simulator.state()
-        for e in self._failures:
+        for e in self.failures:
             # Diverged environments are frozen in an arbitrary finite state.
             simulation.x[e], simulation.v[e], simulation.C[e], simulation.F[e] = 0.5, 0.0, 0.0, np.eye(3)
         starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
-        return EpisodeState(
-            None if self._steps is None else self._steps.copy(),
-            simulation,
-            dict(self._failures),
-            _copies(self._last),
-            tuple(self._seeds),
-            self._episodes.copy(),
-            self._over.copy(),
-            tuple(self.draws.values),
-            np.array(starts),
-            self._stages.saved() if self._stages else (),
-        )
+        episodes = {name: copy.deepcopy(getattr(self, name)) for name in _EPISODES}
+        stages = self._stages.saved() if self._stages else ()
+        return EpisodeState(simulation, episodes, tuple(self.draws.values), np.array(starts), stages)
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
@@ -548,10 +535,8 @@ class EpisodeBatch:
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
             self._new_observer()
-        self._steps = None if state.steps is None else state.steps.copy()
-        self._over = state.over.copy()
-        self._failures, self._last = dict(state.failures), _copies(state.last)
-        self._seeds, self._episodes = list(state.seeds), state.episodes.copy()
+        for name, value in copy.deepcopy(dict(state.episodes)).items():
+            setattr(self, name, value)
         return self._shown()
 
     def _shown(self) -> tuple[Any, dict[str, Any]]:

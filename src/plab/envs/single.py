@@ -84,7 +84,7 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
 
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state from :meth:`get_state`; return its observation and ``info``."""
-        return _first(*self.batch.set_state(state), state.failures)
+        return _first(*self.batch.set_state(state), self.batch.failures)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""

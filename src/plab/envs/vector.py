@@ -128,7 +128,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state from :meth:`get_state`; return its observations and ``info``."""
         observation, info = self.batch.set_state(state)
-        return observation, self._masked(info | self._failures(state.failures))
+        return observation, self._masked(info | self._failures(self.batch.failures))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
