@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config.overrides import explain, variant_changes
 from plab.config.run import Config
+from plab.config.selection import leaves
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
 from plab.errors import ConfigError, pick
 from plab.scenes import MATERIAL_KEYS, Scene, SceneError
@@ -50,29 +51,19 @@ def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
     """Return the lowest and highest values of sampled parameters, by dotted key, sorted; ConfigError if a
     range is invalid, or its key cannot be randomised."""
     found: dict[str, tuple[Any, Any]] = {}
-
-    def collect(node: Any, key: str) -> None:
-        if isinstance(node, Mapping):
-            for name, below in node.items():
-                collect(below, f"{key}.{name}" if key else str(name))
-        elif key != SCENES:
-            found[key] = _range(task, node, key)
-
-    collect(task.randomize, "")
-    count = task.randomize.get(SCENES)
-    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-        raise ConfigError(f"task.randomize.scenes must be a whole number of at least 1, not {count}")
+    for key, bounds in leaves(task.randomize):
+        path = f"task.randomize.{key}"
+        if key == SCENES:
+            if type(bounds) is not int or bounds < 1:
+                raise ConfigError(f"{path} must be a whole number of at least 1, not {bounds}")
+        elif key:
+            if not isinstance(bounds, list | tuple) or len(bounds) != 2:
+                raise ConfigError(f"{path} must be [low, high], not {bounds}")
+            low, high = (checked(task, key, value, path) for value in bounds)
+            if np.any(np.asarray(low) > np.asarray(high)):
+                raise ConfigError(f"{path}: low {low} is above high {high}")
+            found[key] = low, high
     return dict(sorted(found.items()))
-
-
-def _range(task: TaskConfig, bounds: Any, key: str) -> tuple[Any, Any]:
-    path = f"task.randomize.{key}"
-    if not isinstance(bounds, list | tuple) or len(bounds) != 2:
-        raise ConfigError(f"{path} must be [low, high], not {bounds}")
-    low, high = (checked(task, key, value, path) for value in bounds)
-    if np.any(np.asarray(low) > np.asarray(high)):
-        raise ConfigError(f"{path}: low {low} is above high {high}")
-    return low, high
 
 
 def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
@@ -145,9 +136,8 @@ def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
 
 
 def yaws(task: TaskConfig, values: Mapping[str, Any]) -> dict[str, float]:
-    """Return the rotation angles of bodies about vertical axes through their centres [rad]."""
-    found = {name: float(values.get(f"bodies.{name}.yaw", 0.0)) for name in task.bodies}
-    return {name: angle for name, angle in found.items() if angle}
+    """Return the rotation angles of turned bodies about vertical axes through their centres [rad]."""
+    return {name: float(yaw) for name in task.bodies if (yaw := values.get(f"bodies.{name}.yaw"))}
 
 
 def with_own_materials(cfg: Config) -> Config:
