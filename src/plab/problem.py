@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene, drawn_configs
-from plab.config.selection import leaves
+from plab.config.selection import OBSERVATION_KEYS, leaves
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -172,7 +172,7 @@ class Problem:
             plab.config.ConfigError: If the configurations are incompatible.
             plab.targets.TargetError: If a target cannot be built; see also :func:`make_simulator`.
         """
-        _require_alike(cfgs)
+        require_alike(cfgs)
         # Vectorised environments and seeds of a sweep often have equal scenes, which are built once.
         kinds = kinds_of(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
@@ -387,10 +387,11 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
     return np.stack([load_release_target(source, scene, cfg.variant) for scene, cfg in pairs])
 
 
-def _require_alike(cfgs: Sequence[Config]) -> None:
+def require_alike(cfgs: Sequence[Config]) -> None:
+    """Raise ConfigError unless configurations can share a simulator and a space of observations."""
     if isinstance(cfgs, Config) or not cfgs:
         raise ConfigError("give a list of configurations, one per environment: [cfg]")
-    keys = ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets")
+    keys = ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets", *OBSERVATION_KEYS)
     parts = [dict(leaves({key: _plain(attrgetter(key)(cfg)) for key in keys})) for cfg in cfgs]
     for number, this in enumerate(parts):
         if differing := [key for key in parts[0] | this if parts[0].get(key) != this.get(key)]:
@@ -399,5 +400,5 @@ def _require_alike(cfgs: Sequence[Config]) -> None:
             )
 
 
-def _plain(section: Any) -> dict[str, Any]:
-    return section if isinstance(section, dict) else vars(section)
+def _plain(section: Any) -> Any:
+    return getattr(section, "__dict__", section)

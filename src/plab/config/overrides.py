@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
@@ -14,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
+from plab.config.selection import leaves
 from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ConfigError, pick
 
@@ -105,14 +105,12 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
 
 # ---------------------------------------------------------------------------------------------- explanations
 
-COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
+COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
 """Exceptions raised for a wrong configuration."""
 
 
 def explain(error: Exception) -> str:
     """Return a one-line message, without a full stop, for one of :data:`COMPOSE_ERRORS`."""
-    if isinstance(error, RecursionError):
-        return "the configuration refers to itself: look at defaults and ${...}"
     if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|ray|submitit)", str(error)):
         return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
@@ -151,20 +149,8 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
         above = key.rpartition(".")[0]
         return f"unknown key '{key}': {above} has none; if it refers to another key, override that one"
     # For lr=0.1 instead of method.lr=0.1, suggest the key with this ending.
-    deeper = [path for path in _paths(parent) if path.rpartition(".")[2] == last] if "." not in key else []
+    below = leaves(OmegaConf.to_container(parent)) if "." not in key else ()
+    deeper = [path for path, _ in below if path.rpartition(".")[2] == last and not path.startswith("hydra.")]
     if deeper:
         return f"unknown key '{key}'; did you mean {' or '.join(deeper[:3])}? choose from: {', '.join(names)}"
     return f"unknown key '{key}'; {pick(last, names)}"
-
-
-def _paths(node: object, prefix: str = "") -> Iterator[str]:
-    """Return the dotted paths of all keys of dataclass nodes below a node, and of an untyped method."""
-    if not isinstance(node, DictConfig):
-        return
-    if prefix != "method." and not dataclasses.is_dataclass(OmegaConf.get_type(node)):
-        return
-    for key in map(str, node):
-        if key != "hydra":
-            yield f"{prefix}{key}"
-            if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
-                yield from _paths(node[key], f"{prefix}{key}.")

@@ -20,12 +20,11 @@ from gymnasium.error import ResetNeeded
 from plab.config import Config, load_config
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
-from plab.config.selection import OBSERVATION_KEYS
 from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.envs.randomization import EpisodeRandomizer
 from plab.envs.stages import Stages, staged
 from plab.errors import ArgumentError
-from plab.problem import Problem, build_scenes, kinds_of, make_simulator
+from plab.problem import Problem, build_scenes, kinds_of, make_simulator, require_alike
 from plab.scenes import CONTACTS, Camera
 from plab.sim import SimulationError, Simulator, State
 from plab.sim.tensors import Constants, on_device
@@ -243,7 +242,6 @@ class EpisodeBatch:
         """
         if contact not in CONTACTS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
-        _require_alike(cfgs)
         self._randomize, self._success_score = randomize, success_score
         self._terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)
@@ -270,7 +268,7 @@ class EpisodeBatch:
         """
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
-        _require_alike([*self.configs[:1], *cfgs])
+        require_alike([*self.configs[:1], *cfgs])
         cfgs = self._ranged(cfgs)
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
@@ -718,13 +716,6 @@ class Restorable:
     def get_state(self) -> EpisodeState:
         """Return a copy of the state of the episodes; see :meth:`EpisodeBatch.get_state`."""
         return self.batch.get_state()
-
-
-def _require_alike(cfgs: Sequence[Config]) -> None:
-    """Raise ConfigError for configurations with different entries of observations."""
-    for key in OBSERVATION_KEYS:
-        if len({getattr(cfg, key) for cfg in cfgs}) > 1:
-            raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 
 
 def _tensor_like(table: torch.Tensor, values: Array) -> torch.Tensor:
