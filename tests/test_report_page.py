@@ -17,7 +17,6 @@ from plab.render.graphics import missing_graphics
 from plab.report.collect import NAMES, collect
 from plab.report.methods import method
 from plab.report.page import best_runs
-from plab.report.statistics import interquartile_mean, shared_strata
 from plab.results import load
 from synthetic_runs import synthetic_run, template
 from toy_runner import COARSE
@@ -105,16 +104,6 @@ def test_text_of_a_result_cannot_become_a_part_of_the_page(tmp_path: Path) -> No
     page = write(tmp_path / "<b>results", tmp_path / "page", "--no-pictures")
     assert "<b>" not in page.read_text() and "&lt;b&gt;results" in page.read_text()
     assert "<b>own" in {look["name"] for look in content(page)["methods"]}
-
-
-def test_aggregates_are_those_of_the_figures(results: Path, page: Path) -> None:
-    shared = shared_strata(collect(results, select(["task=Move,Rope"], NAMES)))
-    found = content(page)["aggregates"]
-    value, low, high = found["mean"]["adam"]
-    expected = interquartile_mean(shared.strata["adam"])
-    assert (value, low, high) == pytest.approx((expected.value, expected.low, expected.high), abs=1e-4)
-    assert found["better"]["gd"]["adam"][0] == 0.5
-    assert "single run" in found["notes"][-1]
 
 
 # -------------------------------------------------------------------------------------------- in the browser

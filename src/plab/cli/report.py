@@ -94,7 +94,6 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
         except RenderError as error:
             tell(f"without pictures: {error}")
         finally:
-            page.remove_surpassed()
             page.write()
     return "index.html"
 

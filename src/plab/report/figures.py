@@ -277,11 +277,9 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
 
 def aggregates(runs: Runs) -> list[Drawing]:
     """Return interquartile means and probabilities of improvement."""
-    shared = shared_strata(runs)
-    if not shared.keys:
-        return []
-    notes = [*shared.notes, *settings_note(runs)]
-    return [draw(list(shared.strata), shared.strata, notes) for draw in (_interquartile_means, _improvements)]
+    strata, notes = shared_strata(runs)
+    notes += settings_note(runs)
+    return [draw(list(strata), strata, notes) for draw in (_interquartile_means, _improvements) if strata]
 
 
 Strata = Mapping[str, Sequence[np.ndarray]]

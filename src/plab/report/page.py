@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 import shlex
-import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +25,11 @@ from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
 from plab.report.statistics import (
     AXES,
-    Interval,
     Rows,
     Series,
     Summary,
     band,
-    improvement,
-    interquartile_mean,
     load_series,
-    shared_strata,
 )
 from plab.report.tables import Cell, compare, ordered_tasks, settings_note
 from plab.report.writing import origin
@@ -82,7 +77,6 @@ class Page:
                 for one in self.shown
                 if one.film and one.task == task
             ],
-            "aggregates": _aggregates(runs),
             "axes": list(AXES),
             "columns": list(_COLUMNS),
         }
@@ -125,14 +119,6 @@ class Page:
         folders = {self._out / one.folder: (Path(one.run["path"]), one.film) for one in self.shown}
         return {folder: wanted for folder, wanted in folders.items() if not folder.is_dir()}
 
-    def remove_surpassed(self) -> None:
-        """Remove pictures of surpassed runs of configurations that have those of the best run."""
-        for one in self.shown:
-            current = self._out / one.folder
-            for folder in current.parent.glob(f"{one.name}-{'[0-9a-f]' * 8}") if current.is_dir() else ():
-                if folder != current:
-                    shutil.rmtree(folder)
-
 
 def _look(look: Method, place: int) -> dict[str, str]:
     dashes = {"-": "", "--": "6 3", "-.": "7 3 1.5 3", ":": "1.5 3"}[look.dashes]
@@ -147,39 +133,20 @@ def _finite(value: float) -> float | None:
     return None if math.isnan(value) else round(float(value), 4)
 
 
-def _summary(summary: Summary) -> dict[str, Any]:
-    return {"mean": _finite(summary.mean), "std": _finite(summary.std), "count": summary.count}
-
-
-def _ends(found: Interval) -> list[float | None]:
-    return [_finite(value) for value in (found.value, found.low, found.high)]
-
-
 def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -> dict[str, Any]:
     """Return our score, the paper's, and their difference, by method, for a task or one of its variants."""
-    return {
-        name: {
-            "ours": _summary(cell.ours) | {"expected": cell.expected},
-            "paper": _summary(cell.paper),
-            "difference": _ends(cell.difference),
-        }
-        for name in runs.methods
-        for cell in [cells[(*which, name)]]
-    }
 
+    def shown(one: Summary, expected: int) -> dict[str, Any]:
+        numbers = {"mean": _finite(one.mean), "std": _finite(one.std)}
+        return numbers | {"count": one.count, "expected": expected}
 
-def _aggregates(runs: Runs) -> Mapping[str, Any]:
-    """Return interquartile means and probabilities of improvement with their intervals, and notes."""
-    shared = shared_strata(runs)
-    strata = shared.strata
-    return {
-        "notes": shared.notes,
-        "mean": {name: _ends(interquartile_mean(own)) for name, own in strata.items()},
-        "better": {
-            one: {other: _ends(improvement(strata[one], strata[other])) for other in strata if other != one}
-            for one in strata
-        },
-    }
+    found = {}
+    for name in runs.methods:
+        cell = cells[(*which, name)]
+        gap = [_finite(value) for value in vars(cell.difference).values()]
+        ours, paper = shown(cell.ours, cell.expected), shown(cell.paper, 0)
+        found[name] = {"ours": ours, "paper": paper, "difference": gap}
+    return found
 
 
 # ---------------------------------------------------------------------------------------------- configuration

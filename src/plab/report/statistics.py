@@ -114,7 +114,6 @@ Strata = Sequence[np.ndarray]
 
 def interquartile_mean(strata: Strata) -> Interval:
     """Return the interquartile mean of all scores, with its percentile interval."""
-
     scores, samples = np.concatenate(strata), _resampled(strata)
     middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
     found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
@@ -162,23 +161,9 @@ def _interval(value: float, samples: np.ndarray) -> Interval:
     return Interval(float(value), float(low), float(high))
 
 
-@dataclass(frozen=True)
-class Shared:
-    """Scores for the joint comparison of methods.
-
-    Attributes:
-        keys: Task and variant of the configurations for which all methods shown have runs.
-        strata: Scores of each of them, by method.
-        notes: Notes on included and missing runs.
-    """
-
-    keys: list[tuple[str, str]]
-    strata: dict[str, list[np.ndarray]]
-    notes: list[str]
-
-
-def shared_strata(runs: Runs) -> Shared:
-    """Return the scores of the runs, for the methods and configurations of :func:`common_strata`."""
+def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
+    """Return the scores of the runs by method, for the methods and configurations of :func:`common_strata`,
+    and notes on included and missing runs."""
     scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
     for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
         scores[name][task, variant] = own["score"].to_numpy(float)
@@ -197,7 +182,7 @@ def shared_strata(runs: Runs) -> Shared:
     ]
     if any(len(scores) < 2 for own in strata.values() for scores in own):
         notes.append("Configurations with a single run count as if others would give the same.")
-    return Shared(keys, strata, notes)
+    return strata, notes
 
 
 def common_strata(

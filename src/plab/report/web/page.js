@@ -15,6 +15,5 @@ function route() {
 addEventListener("hashchange", () => { route(); scrollTo(0, 0); });
 showGallery();
 showTasks();
-showAggregates();
 showOverview();
 route();

@@ -57,30 +57,3 @@ function showTasks() {
   });
   find("#tasks").replaceChildren(make("thead", {}, head), make("tbody", {}, ...body));
 }
-
-function showAggregates() {
-  const { mean, better, notes } = content.aggregates;
-  const shown = methods.filter(({ name }) => mean[name]);
-  if (!shown.length) return;
-  const part = (value) => `${(100 * Math.min(Math.max(value, 0), 1)).toFixed(2)}%`;
-  const dots = shown.map(({ name, label }) => {
-    const [value, low, high] = mean[name];
-    return make("div", { class: "dots", "data-method": name }, make("span", {}, label),
-      make("span", { class: "track", style: `${own(name)}; --low: ${part(low)}; --high: ${part(high)}; --value: ${part(value)}` }, make("i"), make("b")),
-      make("span", { class: "number" }, make("b", {}, fixed(value)), make("small", {}, ` [${fixed(low)}, ${fixed(high)}]`)));
-  });
-  const panels = [
-    make("div", { class: "panel", id: "mean" }, make("h3", {}, "Interquartile mean"), make("div", { class: "card" }, ...dots)),
-  ];
-  if (shown.length > 1) {
-    const rows = shown.map((one) => make("tr", {}, make("th", {}, ...headOf(one)), ...shown.map((other) => {
-      if (one === other) return make("td", { class: "number none" }, "–");
-      const [value, low, high] = better[one.name][other.name];
-      return make("td", { class: "number value", style: `${own(one.name)}; --part: ${value}` }, make("span", {}, make("b", {}, fixed(value)), make("small", {}, ` [${fixed(low)}, ${fixed(high)}]`)));
-    })));
-    const head = make("tr", {}, make("th", {}, "a run of, better than"), ...shown.map((each) => make("th", { class: "number" }, ...headOf(each))));
-    panels.push(make("div", { class: "panel", id: "better" }, make("h3", {}, "Probability of improvement"),
-      make("div", { class: "scroll" }, make("table", { class: "plain" }, make("thead", {}, head), make("tbody", {}, ...rows)))));
-  }
-  find("#aggregates").replaceChildren(make("h2", {}, "All configurations together"), make("div", { class: "panels" }, ...panels), make("p", { class: "note" }, notes.join(" ")));
-}
