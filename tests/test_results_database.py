@@ -142,7 +142,7 @@ def test_a_run_with_damaged_iterations_is_named_and_left_out_everywhere(folder: 
     with pytest.warns(UserWarning, match=path.name):
         assert ask(folder, "SELECT count(DISTINCT run) FROM iterations") == [(3,)]
     found, packed = collect(folder, Selection()), pack(folder, folder.parent / "all.plab.zip.xz")
-    assert len(load_series(found)) == 3 and path.name in found.left_out()[-1]
+    assert len(load_series(found)) == 3 and path.name in found.left_out[-1]
     assert packed.runs == 3 and path.name in str(packed.unreadable)
 
 

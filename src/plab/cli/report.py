@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> None:
     out = options.out or Path("reports") / options.what
     made = _MAKERS[options.what](runs, options, out, shlex.join(["plab", "report", *argv]))
     print(f"{out}: {made} of {len(runs.table)} out of {runs.expected} runs")
-    for line in runs.left_out():
+    for line in runs.left_out:
         tell(line)
 
 

@@ -54,13 +54,9 @@ class Runs:
         variants: Requested variants.
         methods: Requested methods, in the order of tables.
         seeds: Requested seeds.
-        unfinished: Number of requested runs that are not finished and not in ``table``.
-        others: Number of finished runs that were not requested.
-        set_aside: Number of finished runs left out because others of the same task and method have fewer
-            changes to plab's settings.
         unusual: Settings that differ from plab's, as text, with methods if only some runs have them.
         protocol: Name of their protocol.
-        unreadable: Messages about files that could not be read.
+        left_out: Notes on runs missing from ``table``, with reasons.
         configs: Configurations of the runs, in the order of ``table``.
     """
 
@@ -69,12 +65,9 @@ class Runs:
     variants: list[str]
     methods: list[str]
     seeds: list[str]
-    unfinished: int
-    others: int
-    set_aside: int
     unusual: list[str]
     protocol: str
-    unreadable: list[str]
+    left_out: list[str]
     configs: list[dict[str, Any]]
 
     @property
@@ -89,26 +82,10 @@ class Runs:
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
     @property
-    def present(self) -> list[str]:
-        """Methods with runs, in the order of tables."""
-        names = set(self.table["method"])
-        return [name for name in self.methods if name in names]
-
-    @property
     def expected(self) -> int:
         """Number of requested runs of all tasks, variants and seeds, for methods that have runs."""
-        return len(self.tasks) * len(self.variants) * len(self.seeds) * len(self.present)
-
-    def left_out(self) -> list[str]:
-        """Return notes on runs missing from ``table``, with reasons."""
-        counts = (
-            (self.unfinished, "are not finished, hence not in them"),
-            (self.others, "are of other tasks, variants, methods or seeds, hence not in them"),
-            (self.set_aside, "try other settings than conf/ has, hence are not in them"),
-        )
-        return [f"{count} run(s) {what}" for count, what in counts if count] + [
-            f"left out: {message}" for message in self.unreadable
-        ]
+        present = set(self.table["method"]) & set(self.methods)
+        return len(self.tasks) * len(self.variants) * len(self.seeds) * len(present)
 
 
 def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split: str = "") -> Runs:
@@ -146,18 +123,23 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
     columns = None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
+    counts = {
+        "are not finished, hence not in them": len(inside) - len(complete),
+        "are of other tasks, variants, methods or seeds, hence not in them": (
+            sum(row.values["status"] == "finished" for row in fitting) - len(complete)
+        ),
+        "try other settings than conf/ has, hence are not in them": len(complete) - len(finished),
+    }
+    left_out = [f"{count} run(s) {what}" for what, count in counts.items() if count]
     return Runs(
         table=pd.DataFrame(values, columns=columns).astype({"seed": str}),
         tasks=asked["task"],
         variants=asked["variant"],
         methods=methods,
         seeds=seeds,
-        unfinished=len(inside) - len(complete),
-        others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
-        set_aside=len(complete) - len(finished),
         unusual=unusual,
         protocol=protocol,
-        unreadable=[str(error) for error in unreadable],
+        left_out=[*left_out, *(f"left out: {error}" for error in unreadable)],
         configs=[row.config for row in finished],
     )
 

@@ -41,7 +41,7 @@ def show_origin(runs: Runs, command: str) -> None:
     """Show the command and the result files behind the following output."""
     say(
         f"Made by `{command}` from {len(runs.table)} run(s); SHA-256 over them `{runs.digest}`. "
-        + " ".join(f"{line}." for line in runs.left_out())
+        + " ".join(f"{line}." for line in runs.left_out)
     )
     names = runs.table.reindex(columns=[*NAMES, "config_hash", "path"])
     files = names.to_html(index=False, border=0, classes="plain")

@@ -94,7 +94,7 @@ class Page:
             "methods": [method(name) for name in runs.methods],
             "origin": origin(runs, command),
             "expected": runs.expected,
-            "notes": [*settings_note(runs), *runs.left_out()],
+            "notes": [*settings_note(runs), *runs.left_out],
             "tasks": len(with_runs),
             "all_tasks": len(tasks),
         }

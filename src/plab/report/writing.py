@@ -103,7 +103,8 @@ def origin(runs: Runs, command: str) -> dict[str, Any]:
         "command": command,
         "plab": plab.__version__,
         "digest": runs.digest,
-        **{name: getattr(runs, name) for name in ("unfinished", "others", "set_aside", "unusual")},
+        "left_out": runs.left_out,
+        "unusual": runs.unusual,
         "runs": runs.table[columns].to_dict("records") if len(runs.table) else [],
     }
 
