@@ -26,8 +26,13 @@ if TYPE_CHECKING:
     from plab.problem import Episodes
     from plab.scenes import Scene
 
-PARAMETERS = ("youngs_modulus", "poisson_ratio", "yield_stress", "floor_friction", "gravity")
-"""Parameters that can be fitted; for gravity, the downward acceleration."""
+PARAMETERS = (
+    *("youngs_modulus", "poisson_ratio", "yield_stress"),
+    *("floor_friction", "manipulator_friction", "gravity"),
+)
+"""Parameters that can be fitted; ``manipulator_friction`` is common to all manipulators, and gravity is the
+downward acceleration. The density is not identifiable: with manipulators on prescribed paths, motion depends
+only on the ratios of moduli and yield stress to it."""
 
 HIGHEST_POISSON_RATIO = 0.49
 
@@ -124,6 +129,8 @@ class IdentifyRunner(Runner):
         state["trial"] = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
         variance = state["cost"] / max(residual.size - len(changes), 1)
         deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
+        # Parameters without any effect, such as the friction of a floor that bodies stick to.
+        deviations[np.diag(state["curvature"]) == 0.0] = np.nan
         found = dict.fromkeys(FAMILY.columns, np.nan)
         found["misfit"] = float(np.sqrt(3.0 * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
@@ -163,6 +170,8 @@ class IdentifyRunner(Runner):
 
 
 def _value(scene: Scene, name: str) -> float:
+    if name == "manipulator_friction":
+        return scene.manipulators[0].friction if scene.manipulators else 0.0
     return -scene.gravity[1] if name == "gravity" else getattr(scene, name)
 
 
@@ -170,6 +179,9 @@ def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
     changes: dict[str, Any] = dict(zip(names, values.tolist(), strict=True))
     if "gravity" in changes:
         changes["gravity"] = (scene.gravity[0], -changes["gravity"], scene.gravity[2])
+    if "manipulator_friction" in changes:
+        friction = changes.pop("manipulator_friction")
+        changes["manipulators"] = tuple(replace(own, friction=friction) for own in scene.manipulators)
     if "poisson_ratio" in changes:
         changes["poisson_ratio"] = min(changes["poisson_ratio"], HIGHEST_POISSON_RATIO)
     return replace(scene, **changes)
