@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from plab.errors import ConfigError
+from plab.errors import ConfigError, pick
 
 Kind = TypeVar("Kind")
 
@@ -50,6 +50,15 @@ class Registry(UserDict[str, Any]):
         if isinstance(self.data[name], str):
             self.data[name] = load_object(self.data[name], self._kind)
         return self.data[name]
+
+    def find(self, name: str, key: str) -> Any:
+        """Return the object of a name or, elsewhere, of ``module:NAME``; ConfigError with the configuration's
+        key if there is none."""
+        if ":" in name:
+            return load_object(name, self._kind)
+        if name not in self:
+            raise ConfigError(f"{key} '{name}' does not exist; {pick(name, [*self, 'module:NAME'])}")
+        return self[name]
 
 
 def search_in(config_dir: str | Path) -> None:

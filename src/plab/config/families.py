@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError
 from plab.plugins import Registry, load_object
 
 RL, GRADIENT = "RL", "gradient"
@@ -92,46 +92,25 @@ class Family:
         return self.config if own is None or own.config is None else own.config
 
     def runner_type(self) -> type:
-        """Return the runner.
-
-        Raises:
-            plab.config.ConfigError: If it cannot be imported.
-        """
+        """Return the runner; ConfigError if it cannot be imported."""
         return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
 
 
-FAMILIES: Mapping[str, Family] = Registry(
+_NAMES = ("trajectory", "rl", "apg", "pods", "shac", "bc", "mpc", "identify")
+
+FAMILIES = Registry(
     Family,
-    {
-        "trajectory": "plab.runners.trajectory:FAMILY",
-        "planner": "plab.runners.searches:FAMILY",
-        "rl": "plab.runners.rl:FAMILY",
-        "sb3": "plab.runners.rl:SB3",
-        "apg": "plab.runners.apg:FAMILY",
-        "pods": "plab.runners.pods:FAMILY",
-        "shac": "plab.runners.shac:FAMILY",
-        "bc": "plab.runners.bc:FAMILY",
-        "mpc": "plab.runners.mpc:FAMILY",
-        "identify": "plab.runners.identify:FAMILY",
-    },
+    {name: f"plab.runners.{name}:FAMILY" for name in _NAMES}
+    | {"planner": "plab.runners.searches:FAMILY", "sb3": "plab.runners.rl:SB3"},
 )
 """plab's own families by name, the ``family`` of a method's YAML."""
 
 
 def family(name: str) -> Family:
-    """Return the family of a name, as in ``method.family``.
-
-    Args:
-        name: A key of :data:`FAMILIES`, or the ``module:NAME`` of a record elsewhere.
-
-    Raises:
-        plab.config.ConfigError: If there is none.
-    """
-    if name in FAMILIES:
-        return FAMILIES[name]
-    if ":" in name:
-        return load_object(name, Family)
-    raise ConfigError(f"method.family '{name}' does not exist; {pick(name, [*FAMILIES, 'module:NAME'])}")
+    """Return the family of a key of :data:`FAMILIES`, or of the ``module:NAME`` of a record elsewhere;
+    ConfigError if there is none."""
+    found: Family = FAMILIES.find(name, "method.family")
+    return found
 
 
 def known_family(name: str) -> Family | None:

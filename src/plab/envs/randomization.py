@@ -6,6 +6,7 @@ environment's seed and the number of the episode, not on the batch or the device
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -45,13 +46,11 @@ class _Base:
     cfg: Config
     scene: Scene
     target: Target
-    particles: np.ndarray | None = None
 
-    def sample(self) -> np.ndarray:
-        """Return the particles' positions, shape [particle, 3]."""
-        if self.particles is None:
-            self.particles = sample_particles(self.scene)
-        return self.particles
+    @functools.cached_property
+    def particles(self) -> np.ndarray:
+        """Positions of the particles, shape [particle, 3]."""
+        return sample_particles(self.scene)
 
 
 class EpisodeRandomizer:
@@ -78,9 +77,7 @@ class EpisodeRandomizer:
         }
         targets = zip(problem.target_mass, problem.distances(), strict=True)
         self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, targets, strict=True)]
-        self._placed: list[tuple[_Base, Values, Any]] = [
-            (base, {}, _places(base.scene)) for base in self._bases
-        ]
+        self._placed: list[Any] = [(base, {}, _places(base.scene)) for base in self._bases]
         self._targets: list[Any] = [None for _ in cfgs]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
         for cfg in unique.values():
@@ -192,7 +189,7 @@ def _places(scene: Scene) -> list[Any]:
 
 def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np.ndarray:
     """Return the particle positions of a scene with its bodies at the sampled poses, shape [particle, 3]."""
-    x, bodies = base.sample().copy(), base.scene.particle_bodies
+    x, bodies = base.particles.copy(), base.scene.particle_bodies
     for number, (name, body) in enumerate(zip(base.cfg.task.bodies, base.scene.bodies, strict=True)):
         own, center = bodies == number, np.array(places[number][0])
         if places[number][0] != body.center:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.errors import ConfigError, PlabError, pick
+from plab.errors import PlabError
 from plab.laws import Law
-from plab.plugins import Registry, load_object
+from plab.plugins import Registry
 
 if TYPE_CHECKING:
     from plab.kinematics import Chain
@@ -67,7 +67,7 @@ BODY_SHAPES = ("sphere", "box", "mesh")
 MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
 """Material parameters that bodies inherit from their scene by default, as fields of a :class:`Material`."""
 
-LAWS: Mapping[str, Law] = Registry(
+LAWS = Registry(
     Law,
     {
         name: f"plab.laws.{name}:{name.upper()}"
@@ -88,11 +88,8 @@ def vector3(values: Sequence[float]) -> Vec3:
 def find_law(name: str) -> Law:
     """Return a law by its name, or by ``module:NAME`` for a law outside plab; ConfigError if there is
     none."""
-    if name in LAWS:
-        return LAWS[name]
-    if ":" not in name:
-        raise ConfigError(f"law '{name}' does not exist; {pick(name, list(LAWS))}; or module:NAME")
-    return load_object(name, Law)
+    found: Law = LAWS.find(name, "law")
+    return found
 
 
 class SceneError(PlabError, ValueError):
