@@ -25,6 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.config import ranges
 from plab.config.families import family
 from plab.config.overrides import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
 from plab.config.run import Config
@@ -361,9 +362,7 @@ def _refuse_undone(
 def _choose_profile(method: DictConfig) -> None:
     """Resolve references to the chosen profile, and remove the profiles."""
     if method.get("profile") is not None or method.get("profiles"):
-        if method.profile not in method.profiles:
-            advice = pick(str(method.profile), list(map(str, method.profiles)))
-            raise ConfigError(f"method.profile '{method.profile}' does not exist; {advice}")
+        ranges.one_of("method.profile", str(method.profile), list(map(str, method.profiles)))
         _resolve(method, ["profiles"])
 
 

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from plab.config import Config, load_config
+from plab.config import Config, load_config, ranges
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
 from plab.envs.observations import Observer, Sensors, mapped, spaces
-from plab.envs.randomization import EpisodeRandomizer
-from plab.envs.stages import Stages, staged
+from plab.envs.randomization import EpisodeRandomizer, Stages, staged
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of, make_simulator, require_alike
 from plab.scenes import CONTACTS, Camera
@@ -240,8 +239,7 @@ class EpisodeBatch:
             plab.sim.DeviceError: If CUDA is not available.
             RuntimeError: If this process was forked from one with environments.
         """
-        if contact not in CONTACTS:
-            raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
+        ranges.one_of("contact", contact, CONTACTS)
         self._randomize, self._success_score = randomize, success_score
         self._terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from gymnasium.spaces import Box, Dict, Space
 
-from plab.config import Config
+from plab.config import Config, ranges
 from plab.errors import ArgumentError
 from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
@@ -162,8 +162,8 @@ class Sensors:
             ValueError: If there is no such observation, or nothing to observe.
         """
         self.names = (observe,) if isinstance(observe, str) else tuple(observe)
-        if unknown := [name for name in self.names if name not in OBSERVATIONS]:
-            raise ArgumentError(f"observe '{unknown[0]}' is not one of {', '.join(OBSERVATIONS)}")
+        for name in self.names:
+            ranges.one_of("observe", name, OBSERVATIONS)
         self._pictures = [name for name in self.names if name in PICTURES]
         if not cameras:
             cameras = DEFAULT_CAMERAS if self._pictures and cameras is None else {}
