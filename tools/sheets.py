@@ -14,6 +14,7 @@ from PIL import Image
 from plab.config import load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.render.camera import scene_camera
+from plab.render.graphics import require_graphics
 from plab.render.pictures import tiled
 from plab.render.renderer import Renderer
 from plab.render.rollouts import RecordedRollout, demonstration, record
@@ -33,6 +34,7 @@ def frames(words: list[str], size: tuple[int, int], count: int) -> tuple[Recorde
 
 def main(path: Path) -> None:
     """Write the contact sheet for a PNG, the film strip for a JPEG."""
+    require_graphics()
     sheet, tiles = path.suffix == ".png", []
     for task in suite_tasks():
         for variant in SUITE_VARIANTS[: None if sheet else 1]:

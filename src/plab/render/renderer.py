@@ -138,7 +138,9 @@ class Renderer:
         if np.shape(poses) != (len(self._parts), 8):
             raise ArgumentError(f"poses have shape {np.shape(poses)}, not {(len(self._parts), 8)}")
         self._plotter.clear_actors()
-        # Slightly above the floor, to be visible.
+        # It hides what is below, and its lines are slightly above it.
+        floor = pv.Plane(center=(0.5, 0.0, 0.5), direction=(0.0, 1.0, 0.0), i_size=1.8, j_size=1.8)
+        self._plotter.add_mesh(floor, color=PAPER, lighting=False, reset_camera=False)
         lines = pv.line_segments_from_points(floor_lines(3e-3))
         look = {"opacity": 0.16, "line_width": 1.3, "lighting": False}
         self._plotter.add_mesh(lines, color=INK, reset_camera=False, **look)
@@ -154,7 +156,9 @@ class Renderer:
         """Add a mesh and its shadow on the floor."""
         assert self._plotter is not None
         self._plotter.add_mesh(mesh, name=name, reset_camera=False, **look)
-        shadow = mesh.transform(self._flattened, inplace=False)
+        shadow = mesh.copy()
+        shadow.points[:, 1] = np.maximum(shadow.points[:, 1], 0.0)
+        shadow.transform(self._flattened, inplace=True)
         self._plotter.add_mesh(shadow, name=f"shadow of {name}", reset_camera=False, **_SHADOW)
 
     def _draw(self) -> np.ndarray:

@@ -60,16 +60,13 @@ def manipulator_parts(manipulator: Manipulator) -> list[Part]:
             direction=(0.0, 1.0, 0.0), radius=radius, height=2 * half, resolution=_AROUND
         ),
     }
-    mesh = _smooth(meshes[manipulator.outline](*manipulator.size))
+    mesh = meshes[manipulator.outline](*manipulator.size).clean()
+    mesh = mesh.compute_normals(feature_angle=40.0, split_vertices=True)
     return [Part(mesh, side) for side in ((-0.5, 0.5) if manipulator.kind.grips else (0.0,))]
 
 
 def _capsule(length: float, radius: float) -> pv.PolyData:
     return pv.Capsule(direction=(0.0, 1.0, 0.0), cylinder_length=length, radius=radius, resolution=_AROUND)
-
-
-def _smooth(mesh: pv.PolyData) -> pv.PolyData:
-    return mesh.clean().compute_normals(feature_angle=40.0, split_vertices=True)
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:

@@ -44,13 +44,6 @@ OVERSHOOT = (0.5, 1.5)
 """Range of the pushing distance, relative to the displacement of the pushed point."""
 
 
-def support(tool: Manipulator, direction: np.ndarray) -> float:
-    """Return the extent of a manipulator from its position in a direction, a unit vector [3], at its initial
-    pose; 0 for one that carries between its parts, such as chopsticks."""
-    reach = tool.kind.support
-    return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
-
-
 class ContactStarts:
     """Starts for a scene and its target."""
 
@@ -159,7 +152,10 @@ class ContactStarts:
         along = (points - point) @ direction
         aside = np.linalg.norm(points - point - along[:, None] * direction, axis=1)
         met = point + along[aside < TUBE].min(initial=0.0) * direction
-        place = np.clip(met - support(tool, direction) * direction, tool.lower_bound, tool.upper_bound)
+        # Manipulators that carry between their parts, such as chopsticks, have no extent.
+        own, reach = _rotation(tool).inv().apply(direction), tool.kind.support
+        extent = 0.0 if reach is None else float(reach(tool.size, own))
+        place = np.clip(met - extent * direction, tool.lower_bound, tool.upper_bound)
         return place - np.asarray(tool.position)
 
     def _actions(self, tracks: Sequence[ActionTrack]) -> np.ndarray:

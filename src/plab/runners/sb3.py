@@ -12,11 +12,10 @@ import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer as LibraryBuffer
 from stable_baselines3.common.callbacks import ConvertCallback
@@ -85,8 +84,7 @@ class Sb3Training(Training):
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Make the environments and an untrained model."""
-        (cfg,) = cfgs
-        method: Any = cfg.method
+        (cfg,), method = cfgs, cast(Any, cfgs[0].method)
         self._kind: ModelKind = family(method.family).rules[method.algorithm].what
         rollout = self._kind.rollout_steps
         steps = batch.horizon if rollout is None else rollout(method)
@@ -176,21 +174,13 @@ class _Replay(LibraryBuffer):
     """
 
     def __init__(
-        self,
-        buffer_size: int,
-        observation_space: Box,
-        action_space: Box,
-        device: torch.device | str = "cpu",
-        n_envs: int = 1,
-        *,
-        sizes: Sizes,
-        total_steps: int,
-        **options: Any,
+        self, buffer_size: int, *spaces: Any, sizes: Sizes, total_steps: int, **options: Any
     ) -> None:
-        # The base class allocates its own arrays, here with one row each.
-        super().__init__(n_envs, observation_space, action_space, device, n_envs, **options)
         # The library's save converts the tuple to a list.
-        self.kept = ReplayBuffer(1, Sizes(*sizes), buffer_size, total_steps, torch.device(self.device))
+        sizes = Sizes(*sizes)
+        # The base class allocates its own arrays, here with one row each.
+        super().__init__(sizes.envs, *spaces, **options)
+        self.kept = ReplayBuffer(1, sizes, buffer_size, total_steps, torch.device(self.device))
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
         parts = (obs, action, reward, next_obs)
