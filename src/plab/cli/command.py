@@ -174,11 +174,6 @@ def positive(text: str, least: int = 1) -> int:
     return int(text)
 
 
-def seed(text: str) -> int:
-    """Parse a nonnegative integer."""
-    return positive(text, 0)
-
-
 def task_list(text: str) -> list[str]:
     """Parse comma-separated names of tasks."""
     names = [name.strip() for name in text.split(",")]

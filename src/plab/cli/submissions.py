@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import plab
-from plab.cli.command import Parser, command_line, folder, seed, sources_and_words, to_write
+from plab.cli.command import Parser, command_line, folder, positive, sources_and_words, to_write
 from plab.cli.tables import print_table
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -23,7 +23,7 @@ from plab.submissions.submission import (
     UNSEEN,
     Submission,
     SubmissionError,
-    inconsistency,
+    excess,
     parse_card,
     read,
     write,
@@ -55,7 +55,7 @@ def submit(argv: Sequence[str]) -> None:
     add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
     add("--policy", type=_policy, action="append", default=[], help=what)
-    add("--steps", type=seed, help="with --policy: environment steps in the training of each policy")
+    add("--steps", type=positive, help="with --policy: environment steps in the training of each policy")
     what = f"with --policy: act in the {len(UNSEEN)} unseen configurations of the task, too"
     add("--unseen", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -77,7 +77,7 @@ def submit(argv: Sequence[str]) -> None:
     else:
         chosen = select(words, ("task", "variant", "method", "seed"))
         submission = Submission(card, tuple(from_sources(sources, chosen)))
-    if fault := inconsistency(submission):
+    if fault := excess(submission):
         raise SubmissionError(fault)
     write(submission, options.output)
     configurations = {entry.configuration for entry in submission.entries}

@@ -1,8 +1,7 @@
-"""Tables of the leaderboard: comparable entries, with the paper's and plab's own."""
+"""Tables of the leaderboard: comparable entries, and the paper's numbers."""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,24 +16,17 @@ from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import BUDGETS
-from plab.results import ResultsError, Row
-from plab.results.examples import example_archive
-from plab.results.table import rows
-from plab.submissions.collecting import steps_to_best, submission_files
+from plab.results import ResultsError
+from plab.submissions.collecting import submission_files
 from plab.submissions.submission import (
     UNSEEN,
     Card,
-    Configuration,
     SubmissionError,
-    checksum,
     read,
 )
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
-from plab.targets.store import PHYSICS_VERSION
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_verification
 
 PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
-OWN = Card("", ("plab contributors",), "", budget=0, hardware="NVIDIA H200", gradient=True)
-
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 """Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
 
@@ -71,13 +63,10 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, A
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
-            for kind, line in _submission_lines(path, tuple(overrides)):
+            for kind, line in _submission_lines(path, overrides):
                 lines[kind].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    for card, runs in _runs("example").items():
-        points = [_point(row, steps_to_best(row), "score_best") for row in runs]
-        lines["suite"].append(_line(card, "plans", "own runs", SUITE_VARIANTS, points))
     played = "Score of one episode in the hard contact model, of the plan or policy handed in; protocol=plab"
     sections = [
         _table(title, f"{played}, {what}.", variants, lines[kind])
@@ -100,8 +89,8 @@ def _line(
     """Return a line of a table.
 
     Returns:
-        ``card``; ``track`` (``plans`` or ``policies``); ``status`` (``verified``, ``claimed``, ``printed``,
-        the paper's, or ``own runs``, plab's); ``covered``, number of configurations with a score; ``score``,
+        ``card``; ``track`` (``plans`` or ``policies``); ``status`` (``verified``, ``claimed`` or, for the
+        paper's, ``printed``); ``covered``, number of configurations with a score; ``score``,
         mean over all configurations of the table, missing ones counting as 0; ``budgets``, the same within
         each budget, None without entries; ``tasks``, the same by task, None without scores.
     """
@@ -129,12 +118,7 @@ def _line(
 # ------------------------------------------------------------------------------------------------ submissions
 
 
-@functools.cache
-def _known_checksum(one: Configuration, overrides: tuple[str, ...]) -> str:
-    return checksum(one.config(overrides))
-
-
-def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _submission_lines(path: Path, overrides: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the lines of a submission with their tables.
 
     Raises:
@@ -143,13 +127,7 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
     submission = read(path)
     if submission.card is None:
         raise SubmissionError(f"{path} has no card: plab submit makes a submission of recordings")
-    if submission.physics != PHYSICS_VERSION:
-        what = f"physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
-        raise SubmissionError(f"{path} is of {what}")
-    for entry in submission.entries:
-        if entry.checksum != _known_checksum(entry.configuration, overrides):
-            other = f"scene or target of {entry.configuration.name} is another one than on this leaderboard"
-            raise SubmissionError(f"{path}: the {other}")
+    configs_of(submission, overrides)
     verdicts, status = read_verification(submission), "claimed"
     if wrong := [one for one in verdicts if one.outcome in (LIES, BROKE_OFF)]:
         raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
@@ -160,33 +138,14 @@ def _submission_lines(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[
         own, score = entry.configuration, entry.score
         if verdicts and not math.isnan(verdicts[number].score):
             score = verdicts[number].score
-        tables["unseen" if own.variant in UNSEEN else "suite"].append(
-            (own.task, own.variant, entry.steps, score)
-        )
+        point = own.task, own.variant, entry.steps, score
+        tables["unseen" if own.variant in UNSEEN else "suite"].append(point)
     for kind, points in tables.items():
         yield kind, _line(submission.card, submission.track, status, _TABLES[kind][-1], points)
 
 
-# -------------------------------------------------------------------------------------------- first entries
-
-
-@functools.cache
-def _runs(archive: str) -> dict[Card, list[Row]]:
-    """Return the runs of gradient methods with seed 0 in a bundled archive, by method."""
-    groups: dict[Card, list[Row]] = defaultdict(list)
-    for row in rows(example_archive(archive))[0]:
-        look = method(row.values["method"])
-        if row.values["seed"] == 0 and look.kind == GRADIENT:
-            groups[replace(OWN, name=look.label)].append(row)
-    return groups
-
-
-def _point(row: Row, steps: int, score: str) -> Point:
-    return row.values["task"], row.values["variant"], steps, row.values[score]
-
-
 def _paper() -> dict[str, Any]:
-    """Return the paper's table, with comparable runs of plab."""
+    """Return the paper's table."""
     lines = []
     for name, own in paper_table("iou_per_configuration").groupby("method", sort=False):
         look = method(str(name))
@@ -195,13 +154,10 @@ def _paper() -> dict[str, Any]:
         points = own[["task", "variant"]].assign(steps=_PAPER_STEPS[gradient], score=own["iou_mean"])
         track = "plans" if gradient else "policies"
         lines.append(_line(card, track, "printed", SUITE_VARIANTS, points.itertuples(index=False, name=None)))
-    for card, runs in _runs("release").items():
-        own = [_point(row, _PAPER_STEPS[True], "score") for row in runs]
-        lines.append(_line(card, "plans", "own runs", SUITE_VARIANTS, own))
     protocol = (
         "protocol=release, the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
-        f"{PAPER_SEED_COUNT} seeds in the paper, of one seed of plab's runs. Nothing handed in is judged "
-        "like this, so that these numbers compare with those of no other table."
+        f"{PAPER_SEED_COUNT} seeds. Nothing handed in is judged like this, so that these numbers compare "
+        "with those of no other table."
     )
     return _table("The paper's table", protocol, SUITE_VARIANTS, lines)

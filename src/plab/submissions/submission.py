@@ -10,6 +10,7 @@ import io
 import json
 import re
 import zipfile
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
@@ -265,28 +266,22 @@ def read(path: str | Path) -> Submission:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     card = parse_card(members[_CARD], f"{path}: {_CARD}") if _CARD in members else None
     submission = Submission(card, entries, policies, version, physics, path, digest)
-    if fault := inconsistency(submission):
+    if fault := excess(submission):
         raise SubmissionError(f"{path}: {fault}")
     return submission
 
 
-def inconsistency(submission: Submission) -> str | None:
-    """Return the contradiction within a submission; None if there is none."""
-    if submission.policies and any(entry.actions is not None for entry in submission.entries):
-        return "it holds plans and policies: submit them apart"
-    seen: set[tuple[Configuration, int]] = set()
+def excess(submission: Submission) -> str | None:
+    """Return a message if the entries took more steps than the card's budget; None if they did not."""
     # A policy is trained once for all its configurations, a plan for a single one.
-    spent: dict[Any, int] = {}
+    spent: dict[Any, int] = defaultdict(int)
     for entry in submission.entries:
-        if (entry.configuration, entry.steps) in seen:
-            return f"it has two entries for {entry.name}"
-        seen.add((entry.configuration, entry.steps))
         key = entry.policy or entry.configuration
-        spent[key] = max(spent.get(key, 0), entry.steps)
+        spent[key] = max(spent[key], entry.steps)
     total, card = sum(spent.values()), submission.card
-    if card is not None and total > card.budget:
-        return f"its card has a budget of {card.budget:,} steps, its entries took {total:,}"
-    return None
+    if card is None or total <= card.budget:
+        return None
+    return f"its card has a budget of {card.budget:,} steps, its entries took {total:,}"
 
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:

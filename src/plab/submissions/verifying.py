@@ -5,6 +5,7 @@ Policies are TorchScript or ONNX. Loading a policy executes it, so this happens 
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import math
@@ -70,7 +71,7 @@ def verify(
             tasks.
         plab.config.ConfigError: If an override is invalid.
     """
-    cfgs = _configs(submission, overrides)
+    cfgs = configs_of(submission, overrides)
     # Each group fits into one simulator.
     alike: dict[tuple[str, str], list[Entry]] = defaultdict(list)
     for entry in submission.entries:
@@ -87,8 +88,13 @@ def verify(
     return [verdicts.get(id(one), Verdict(one, math.nan, NOT_RUN, why)) for one in submission.entries]
 
 
-def _configs(submission: Submission, overrides: Sequence[str]) -> dict[Configuration, Config]:
-    """Compose all configurations, and reject those that differ from the submission's."""
+def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configuration, Config]:
+    """Compose the configurations of a submission.
+
+    Raises:
+        SubmissionError: If its physics, a scene or a target differ from this plab's with the overrides.
+        plab.config.ConfigError: If an override is invalid.
+    """
     versions = f"({submission.plab}, this is {plab.__version__})"
     if submission.physics != PHYSICS_VERSION:
         raise SubmissionError(
@@ -97,14 +103,19 @@ def _configs(submission: Submission, overrides: Sequence[str]) -> dict[Configura
         )
     found: dict[Configuration, Config] = {}
     for entry in submission.entries:
-        one = entry.configuration
-        cfg = found[one] = found.get(one) or one.config(overrides)
-        if entry.checksum != checksum(cfg):
+        found[entry.configuration], known = _composed(entry.configuration, tuple(overrides))
+        if entry.checksum != known:
             raise SubmissionError(
-                f"{submission.path}: the scene or target of {one.name} is another one than here: give the "
-                f"overrides that it was made with, or use its plab {versions}"
+                f"{submission.path}: the scene or target of {entry.configuration.name} is another one than "
+                f"here: give the overrides that it was made with, or use its plab {versions}"
             )
     return found
+
+
+@functools.cache
+def _composed(one: Configuration, overrides: tuple[str, ...]) -> tuple[Config, str]:
+    cfg = one.config(overrides)
+    return cfg, checksum(cfg)
 
 
 def _verdict(entry: Entry, score: float, failure: str) -> Verdict:
