@@ -72,8 +72,7 @@ class RunFile:
         self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
-        # Files and number of iterations of earlier processes.
-        self._found: set[Path] = set()
+        # Number of iterations of earlier processes.
         self._known = 0
         earlier = self._finished_earlier()
         if earlier is not None and not config["force"]:
@@ -104,7 +103,6 @@ class RunFile:
         if self.finished:
             self.release()
             return
-        self._found = set(self._files())
         self._known = self._state[0].rows
         if not self.partial_path.exists():
             # A run in progress has a file from the start, for plab status and to detect a full disk.
@@ -118,29 +116,18 @@ class RunFile:
                 self._remove(REPLAY_SUFFIX, PARTIAL_SUFFIX)
                 lock.release()
 
-    def _files(self) -> list[Path]:
-        """Return the files of the run, except its lock."""
-        stem, lock = f"{self.path.stem}.", lock_path(self.path)
-        return [path for path in self.path.parent.iterdir() if path.name.startswith(stem) and path != lock]
-
     def _remove(self, *suffixes: str) -> None:
         """Remove temporary files of the run, and those with the given suffixes."""
-        for path in self._files():
+        for path in self.path.parent.glob(f"{self.path.stem}.*"):
             if path.name.endswith((".tmp", *suffixes)):
                 path.unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """Release a rejected run, and remove its files unless it can resume from them.
-
-        Files of earlier processes are kept.
-        """
+        """Release a rejected run, and remove its files unless it can resume from them."""
         if self._lock is not None and not self.result.rows:
-            for path in set(self._files()) - self._found:
-                if path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    with suppress(OSError):
-                        path.unlink(missing_ok=True)
+            with suppress(OSError):
+                self._remove(PARTIAL_SUFFIX, REPLAY_SUFFIX)
+            shutil.rmtree(self.path.with_suffix(".tensorboard"), ignore_errors=True)
         self._release_empty_folders()
 
     def _release_empty_folders(self) -> None:
