@@ -239,21 +239,16 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     @ti.func
-    def collect_frame_adjoint(self, e, m):
-        """Sum the chunks' frame adjoints of one manipulator, and clear them."""
-        bar = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
-        for c in range(self.chunks):
-            for i in ti.static(range(FRAME_ADJOINT)):
-                bar[i] += self.frame_bar[e * self.chunks + c, m, i]
-                self.frame_bar[e * self.chunks + c, m, i] = 0.0
-        return bar
-
-    @ti.func
     def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
         """Adjoint of all manipulators' motion in substep s: pose_bar goes from its end to its start."""
         for _shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
-                end_bar, start_bar = self.frame_shares(e, start, m, s, self.collect_frame_adjoint(e, m))
+                frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
+                for c in range(self.chunks):
+                    for i in ti.static(range(FRAME_ADJOINT)):
+                        frame[i] += self.frame_bar[e * self.chunks + c, m, i]
+                        self.frame_bar[e * self.chunks + c, m, i] = 0.0
+                end_bar, start_bar = self.frame_shares(e, start, m, s, frame)
                 u = self.substep_motion(e, start, m, actions, t)
                 pose_bar, u_bar = self.retreat_pose(e, start, m, s, u, self.pose_bar[e, m] + end_bar)
                 self.pose_bar[e, m] = pose_bar + start_bar
@@ -279,20 +274,16 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                 self.scatter_mass(grid_index, base, fx)
                 if ti.static(len(self.particle_terms) > 0):
                     part += self.particle_measures(e, x, self.vector(state, source + AT_V, lane))
-                self.accumulate_distances(e, c, tile * self.lanes + lane, x)
+                if ti.static(len(self.distance_terms) > 0):
+                    for shape, start, stop in ti.static(self.shape_ranges):
+                        if ti.static(self.moves(shape)):
+                            for m in range(start, stop):
+                                d = self.end_distance(shape, e, m, x)
+                                for k, _column, term in ti.static(self.distance_terms):
+                                    tally = self.tally_part[k, e, c, m]
+                                    particle = tile * self.lanes + lane
+                                    self.tally_part[k, e, c, m] = term.add(tally, d, particle)
         self.particle_part[e, c] = part
-
-    @ti.func
-    def accumulate_distances(self, e, c, particle, x):
-        """Accumulate the distances of a particle of a chunk."""
-        if ti.static(len(self.distance_terms) > 0):
-            for shape, start, stop in ti.static(self.shape_ranges):
-                if ti.static(self.moves(shape)):
-                    for m in range(start, stop):
-                        d = self.end_distance(shape, e, m, x)
-                        for k, _column, term in ti.static(self.distance_terms):
-                            tally = self.tally_part[k, e, c, m]
-                            self.tally_part[k, e, c, m] = term.add(tally, d, particle)
 
     @ti.func
     def node_terms_chunk(self, e, c):
@@ -314,15 +305,6 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         self.node_part[e, c] = part
 
     @ti.func
-    def particle_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
-        """Add the gradient of the terms of nodes and particles to the particles' adjoints."""
-        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
-            source = self.tile_entry(slot, e, tile)
-            entry = self.tile_entry(0, e, tile)
-            for lane in range(self.lanes_of(tile)):
-                self.add_particle_gradient(state, source, bar, entry, lane, e)
-
-    @ti.func
     def distance_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
         """Add the gradient of distance terms over all particles to the particle adjoints and to the chunk's
         part of the pose adjoints."""
@@ -341,13 +323,6 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                             self.pose_part[e, c, m] = self.pose_part[e, c, m] + pose_bar
                             for i in ti.static(range(3)):
                                 bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
-
-    @ti.func
-    def join_pose_gradients(self, e):
-        """Add the chunks' shares to the poses' adjoints."""
-        for c in range(self.chunks):
-            for m in range(self.manipulators):
-                self.pose_bar[e, m] += self.pose_part[e, c, m]
 
 
 class TeamChoice:
@@ -460,14 +435,20 @@ class CpuEngine(CpuPhases):
         those of the poses without ``contact``."""
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
             if contact:
-                self.particle_gradient_chunk(state, slot, bar, e, c)
+                for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+                    source = self.tile_entry(slot, e, tile)
+                    entry = self.tile_entry(0, e, tile)
+                    for lane in range(self.lanes_of(tile)):
+                        self.add_particle_gradient(state, source, bar, entry, lane, e)
             if ti.static(self.beyond_nearest):
                 self.distance_gradient_chunk(state, slot, bar, e, c)
         self.barrier(team, size)
         if rank == 0:
             self.nearest_gradient(state, slot, bar, e)
             if ti.static(self.beyond_nearest):
-                self.join_pose_gradients(e)
+                for c in range(self.chunks):
+                    for m in range(self.manipulators):
+                        self.pose_bar[e, m] += self.pose_part[e, c, m]
         self.barrier(team, size)
 
     # -- kernels ------------------------------------------------------------------------------------

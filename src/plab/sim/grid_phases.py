@@ -144,7 +144,8 @@ class GridPhases(Storage):
         if strength > 0.0:
             # Contact with static manipulators does not depend on actions.
             if ti.static(MANIPULATOR_SHAPES[shape].moves):
-                self.note_contact(e)
+                if self.touched[e] == 0:
+                    self.touched[e] = 1
             normal = self.out_of_frame(shape, e, s, m, n_local)
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
             r = v - u
@@ -153,11 +154,6 @@ class GridPhases(Storage):
                 t = with_friction(r - rn * normal, rn, self.friction[e, m])
                 out = u + (1.0 - strength) * r + strength * t
         return out
-
-    @ti.func
-    def note_contact(self, e):
-        if self.touched[e] == 0:
-            self.touched[e] = 1
 
     @ti.func
     def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):

@@ -215,19 +215,6 @@ def quaternion(pose):
     return vec4(pose[3], pose[4], pose[5], pose[6])
 
 
-@ti.func
-def with_unit_rotation(pose):
-    """A pose, its rotation made a unit quaternion.
-
-    Actions preserve its length, so the gradient with respect to actions is unaffected.
-    """
-    q = quaternion(pose)
-    out = pose
-    for i in ti.static(range(4)):
-        out[3 + i] = q[i] / ti.sqrt(q.dot(q))
-    return out
-
-
 class PosePhases(Storage):
     """Poses within one environment step and the frames in which contact is computed.
 
@@ -255,19 +242,16 @@ class PosePhases(Storage):
         return u
 
     @ti.func
-    def note_step(self, e, t):
-        """Record environment step t if it starts before the first contact."""
-        if self.touched[e] == 0:
-            self.untouched_step[e] = t
-
-    @ti.func
     def given_pose(self, poses: ti.template(), slot, e, m):
         """Manipulator m's pose in slot ``slot`` of the pose history."""
         pose = vec8(0.0)
         for i in ti.static(range(8)):
             pose[i] = poses[((slot * self.batch + e) * self.manipulators + m) * 8 + i]
         if ti.static(self.rotations_as_given):
-            pose = with_unit_rotation(pose)
+            # Actions preserve the length of quaternions, so gradients with respect to actions are unaffected.
+            q = quaternion(pose)
+            for i in ti.static(range(4)):
+                pose[3 + i] = q[i] / ti.sqrt(q.dot(q))
         return pose
 
     @ti.func
@@ -276,8 +260,8 @@ class PosePhases(Storage):
     ):
         """Poses of one manipulator in all substeps of environment step t, from slot ``before`` of the pose
         history to slot ``after``."""
-        if m == 0:
-            self.note_step(e, t)
+        if m == 0 and self.touched[e] == 0:
+            self.untouched_step[e] = t
         pose = self.given_pose(poses, before, e, m)
         self.pose[e, 0, m] = pose
         u = self.substep_motion(e, start, m, actions, t)

@@ -134,20 +134,9 @@ class TermPhases(Storage):
         return grid[node][3]
 
     @ti.func
-    def slope_at(self, slopes: ti.template(), e, at, dense: ti.template()):
-        """Slope at a node by its array index: from a grid, or from n^3 numbers per environment
-        (``dense``)."""
-        out = ti.cast(0.0, self.real)
-        if ti.static(dense):
-            out = ti.cast(slopes[self.entry(e, at - 1)], self.real)
-        else:
-            out = self.node_slope(slopes, e * self.nodes + self.linear(at))
-        return out
-
-    @ti.func
     def mass_slope(self, slopes: ti.template(), e, base, fx, dense: ti.template()):
-        """Gradient of the node terms with respect to one particle's position, from the slopes at the
-        nodes."""
+        """Gradient of the node terms with respect to one particle's position, from the slopes at the nodes:
+        in a grid, or n^3 numbers per environment (``dense``)."""
         w = spline(fx)
         dw = spline_slope(fx)
         out = fx * 0.0
@@ -155,7 +144,12 @@ class TermPhases(Storage):
             for j in ti.static(range(3)):
                 for k in ti.static(range(3)):
                     at = self.folded_node(base, i, j, k)
-                    out += self.slope_at(slopes, e, at, dense) * ti.Vector(
+                    slope = ti.cast(0.0, self.real)
+                    if ti.static(dense):
+                        slope = ti.cast(slopes[self.entry(e, at - 1)], self.real)
+                    else:
+                        slope = self.node_slope(slopes, e * self.nodes + self.linear(at))
+                    out += slope * ti.Vector(
                         [
                             dw[i][0] * w[j][1] * w[k][2],
                             w[i][0] * dw[j][1] * w[k][2],
@@ -167,21 +161,17 @@ class TermPhases(Storage):
     # -- terms of nodes and particles ---------------------------------------------------------------
 
     @ti.func
-    def is_empty(self, mass):
-        """Return True if a node holds no mass; False for NaN."""
-        out = mass <= 0.0
-        if ti.static(self.lowest_base == 0):
-            out = mass == 0.0
-        return out
-
-    @ti.func
     def node_measures(self, e, i, mass):
         """Return the shares of a node, by its array index, in the terms of the mass tensor, followed by its
         mass; and the slope of the loss there."""
         values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         slope = 0.0 * mass
         node = i - 1
-        if self.in_tensor(node) and not self.is_empty(mass):
+        # False for NaN.
+        empty = mass <= 0.0
+        if ti.static(self.lowest_base == 0):
+            empty = mass == 0.0
+        if self.in_tensor(node) and not empty:
             for k, column, term in ti.static(self.node_terms):
                 values[k] = ti.cast(term.measure(e, node, mass), ti.f64)
                 if ti.static(term.weighted):
@@ -197,9 +187,11 @@ class TermPhases(Storage):
         return values
 
     @ti.func
-    def particle_gradient(self, e, base, fx, x, v):
-        """Derivatives of the weighted terms of nodes and particles with respect to a particle's position and
-        velocity."""
+    def add_particle_gradient(self, state: ti.template(), entry, bar: ti.template(), target, lane, e):
+        """Add the gradient of the weighted terms of nodes and particles to a particle's adjoint."""
+        x = self.vector(state, entry, lane)
+        v = self.vector(state, entry + AT_V, lane)
+        base, fx = self.stencil(x)
         x_bar = x * 0.0
         v_bar = x * 0.0
         if ti.static(len(self.node_terms) > 0):
@@ -208,15 +200,6 @@ class TermPhases(Storage):
             along_x, along_v = term.gradient(e, x, v)
             x_bar += self.term_weights[column] * along_x
             v_bar += self.term_weights[column] * along_v
-        return x_bar, v_bar
-
-    @ti.func
-    def add_particle_gradient(self, state: ti.template(), entry, bar: ti.template(), target, lane, e):
-        """Add the gradient of the terms of nodes and particles to a particle's adjoint."""
-        x = self.vector(state, entry, lane)
-        v = self.vector(state, entry + AT_V, lane)
-        base, fx = self.stencil(x)
-        x_bar, v_bar = self.particle_gradient(e, base, fx, x, v)
         for i in ti.static(range(3)):
             bar[target + i][lane] = bar[target + i][lane] + x_bar[i]
             if ti.static(len(self.particle_terms) > 0):
