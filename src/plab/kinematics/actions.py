@@ -105,7 +105,9 @@ class JointActions:
             for move in moves:
                 at.append((at[-1] + move).clamp(c["low"], c["high"]))
             frames = self.frames(torch.stack(at))
-            twists = torch.cat([_displacements(frames), _rotations(frames)], dim=-1)
+            turns = frames[..., :3, :3]
+            turned = rotation_vector(_product(turns[1:], turns[:-1].transpose(-1, -2)))
+            twists = torch.cat([frames[1:, ..., :3, 3] - frames[:-1, ..., :3, 3], turned], dim=-1)
             raw = torch.cat([given[..., : self._direct], twists.flatten(2)], dim=-1)
         return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
 
@@ -113,21 +115,17 @@ class JointActions:
         """Transforms from the links' frames to the world by joint positions, shape [T, batch, joint]; shape
         [T, batch, link, 4, 4]."""
         c = self._on(joints.device)
-        moved = self._joint_frames(joints.index_select(-1, c["order"]), c)
+        positions = joints.index_select(-1, c["order"])[..., None, None]
+        angle = positions * c["hinge"][..., None, None]
+        # Rodrigues' formula in homogeneous coordinates: rotations fix the anchor, slides move along the axis.
+        turn = angle.sin() * c["cross"] + (1.0 - angle.cos()) * c["cross2"]
+        moved = c["eye"] + _product(turn, c["to_anchor"]) + positions * c["slide"]
         own = _product(c["offset"], moved).split(self._sizes, dim=2)
         world = [own[0]]
         for k, frames in enumerate(own[1:]):
             world.append(_product(world[-1].index_select(2, c[f"parents{k}"]), frames))
         still = c["eye"].expand(*joints.shape[:2], 1, 4, 4)
         return _product(torch.cat([still, *world], dim=2).index_select(2, c["carriers"]), c["links"])
-
-    @staticmethod
-    def _joint_frames(joints: Tensor, c: dict[str, Tensor]) -> Tensor:
-        """Transforms of the joints' own motions, shape [T, batch, joint, 4, 4], by Rodrigues' formula."""
-        angle = (joints * c["hinge"])[..., None, None]
-        # In homogeneous coordinates: rotations fix the anchor, slides move along the axis.
-        turn = angle.sin() * c["cross"] + (1.0 - angle.cos()) * c["cross2"]
-        return c["eye"] + _product(turn, c["to_anchor"]) + joints[..., None, None] * c["slide"]
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
         """Numbers of the chains on a device."""
@@ -159,15 +157,6 @@ def rotation_vector(turn: Tensor) -> Tensor:
     # angle / sin(angle), as a series in sin(angle)^2 near 0.
     ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, torch.atan2(sine, cosine) / sine)
     return ratio[..., None] * axis
-
-
-def _displacements(frames: Tensor) -> Tensor:
-    return frames[1:, ..., :3, 3] - frames[:-1, ..., :3, 3]
-
-
-def _rotations(frames: Tensor) -> Tensor:
-    turns = frames[..., :3, :3]
-    return rotation_vector(_product(turns[1:], turns[:-1].transpose(-1, -2)))
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

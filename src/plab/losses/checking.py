@@ -53,12 +53,18 @@ def check_gradient(
     simulator.set_state(start)
     gradient = simulator.loss_gradient()
     slopes: dict[str, list[tuple[float, float]]] = {}
+
+    def loss(part: str, shift: np.ndarray) -> float:
+        """Loss of all environments with one part of the state shifted."""
+        simulator.set_state(replace(start, **{part: getattr(start, part) + shift}))
+        return float(simulator.losses().sum()) * term.weight
+
     for part in ("x", "v", "poses"):
         for _ in range(directions):
             way = rng.normal(size=getattr(start, part).shape)
             if part == "poses":
                 way *= _free(scenes[0])
-            ends = [_loss(simulator, start, part, sign * STEP * way) for sign in (1, -1)]
+            ends = [loss(part, sign * STEP * way) for sign in (1, -1)]
             pair = (ends[0] - ends[1]) / (2 * STEP), float((getattr(gradient, part) * way).sum())
             slopes.setdefault(part, []).append(pair)
     largest = max(abs(slope) for pairs in slopes.values() for pair in pairs for slope in pair)
@@ -88,10 +94,3 @@ def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:
     poses[..., 3:7] += rng.normal(scale=0.1, size=poses[..., 3:7].shape)
     poses[..., 3:7] /= np.linalg.norm(poses[..., 3:7], axis=-1, keepdims=True)
     return replace(rest, v=rng.normal(size=rest.v.shape), poses=poses)
-
-
-def _loss(simulator: Simulator, start: State, part: str, shift: np.ndarray) -> float:
-    """Weighted loss of all environments with one part of the state shifted."""
-    simulator.set_state(replace(start, **{part: getattr(start, part) + shift}))
-    weights = [term.weight for term in simulator.terms]
-    return float((simulator.losses() @ weights).sum())

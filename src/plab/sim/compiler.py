@@ -108,7 +108,16 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
         # Quadrants traces a kernel twice.
         if isinstance(function, Kernel) and "launch_kernel" not in vars(function):
             tell(function.func.__name__)
-            _notify_after_launch(function, tell)
+
+            def launch(*launched: Any, **words: Any) -> Any:
+                # Only for this launch; the instance attribute hides the method.
+                del function.launch_kernel
+                try:
+                    return function.launch_kernel(*launched, **words)
+                finally:
+                    tell("")
+
+            function.launch_kernel = launch
         return original(function, *args, **kwargs)
 
     setattr(_traced, _TRACE, entry)
@@ -116,19 +125,6 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         setattr(_traced, _TRACE, original)
-
-
-def _notify_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
-
-    def launch(*args: Any, **kwargs: Any) -> Any:
-        # Only for this launch; the instance attribute hides the method.
-        del kernel.launch_kernel
-        try:
-            return kernel.launch_kernel(*args, **kwargs)
-        finally:
-            tell("")
-
-    kernel.launch_kernel = launch
 
 
 # -- memory -------------------------------------------------------------------------------------------------

@@ -47,12 +47,6 @@ def device_attribute(number: int) -> int:
     return max(1, value.value)
 
 
-def resident_blocks(number_bytes: int) -> int:
-    """Return a lower bound on the resident blocks per multiprocessor of the single-launch step."""
-    shared = number_bytes * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
-    return max(1, min(RESIDENT_BLOCKS, device_attribute(SHARED_BYTES) // shared))
-
-
 @ti.data_oriented
 class CudaEngine(CudaPhases):
     """Kernels for CUDA; public methods as those of :class:`plab.sim.cpu_engine.CpuEngine`.
@@ -70,7 +64,10 @@ class CudaEngine(CudaPhases):
         self.pose_threads = self.batch * max(1, self.manipulators)
         # Threads of as many blocks as move all poses.
         self.frame_threads = -(-self.pose_threads // POSE_SHARE) * RESIDENT_BLOCK
-        blocks = device_attribute(MULTIPROCESSORS) * resident_blocks(SIZES[self.real])
+        shared = SIZES[self.real] * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
+        # A lower bound on the resident blocks per multiprocessor.
+        fitting = max(1, min(RESIDENT_BLOCKS, device_attribute(SHARED_BYTES) // shared))
+        blocks = device_attribute(MULTIPROCESSORS) * fitting
         self.resident_threads = blocks * RESIDENT_BLOCK
         self.last_arrival = ctypes.c_int32((1 << 31) - (blocks - 1)).value
         # Few particles are distributed over more warps, so that each finishes earlier.
@@ -216,7 +213,12 @@ class CudaEngine(CudaPhases):
                         if start <= m < stop:
                             self.reduce_distances(e, m, q % DISTANCE_GROUPS)
         for e in range(self.batch):
-            self.take_measures(e)
+            nodes, particles = ti.static(len(self.node_terms), len(self.particle_terms))
+            for k in ti.static(range(nodes)):
+                self.node_part[e, 0][k] = self.take_sum(self.measure_sums, e * (nodes + particles) + k)
+            for k in ti.static(range(particles)):
+                own = e * (nodes + particles) + nodes + k
+                self.particle_part[e, 0][k] = self.take_sum(self.measure_sums, own)
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
             self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
             if e == 0:
@@ -237,7 +239,10 @@ class CudaEngine(CudaPhases):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
             if ti.static(self.beyond_nearest):
-                self.take_poses(e)
+                for m in range(self.manipulators):
+                    for i in ti.static(range(8)):
+                        total = self.take_sum(self.pose_sums, (e * self.manipulators + m) * 8 + i)
+                        self.pose_bar[e, m][i] += total
             self.nearest_gradient(state, slot, bar, e)
 
     @ti.kernel

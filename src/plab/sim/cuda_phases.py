@@ -390,38 +390,10 @@ class CudaPhases(OrderPhases, PosePhases):
         self.add_up(self.measure_sums, e * count + number, value)
 
     @ti.func
-    def take_measures(self, e):
-        """Move an environment's sums over nodes and particles to the joint measures."""
-        nodes, particles = ti.static(len(self.node_terms), len(self.particle_terms))
-        for k in ti.static(range(nodes)):
-            self.node_part[e, 0][k] = self.take_sum(self.measure_sums, e * (nodes + particles) + k)
-        for k in ti.static(range(particles)):
-            self.particle_part[e, 0][k] = self.take_sum(
-                self.measure_sums, e * (nodes + particles) + nodes + k
-            )
-
-    @ti.func
-    def take_poses(self, e):
-        """Add the accumulated contributions of particle distances to the pose adjoints of an environment."""
-        for m in range(self.manipulators):
-            for i in ti.static(range(8)):
-                total = self.take_sum(self.pose_sums, (e * self.manipulators + m) * 8 + i)
-                self.pose_bar[e, m][i] += total
-
-    @ti.func
     def take_material(self, row):
         """Add the contributions accumulated in an environment step to the adjoint of a material."""
         for i in ti.static(range(self.coefficients)):
             self.material_bar[row, i] += self.take_sum(self.material_sums, row * self.coefficients + i)
-
-    @ti.func
-    def note_distances(self, e, particle, x):
-        """Write one particle's distances from the moving manipulators."""
-        for shape, start, stop in ti.static(self.shape_ranges):
-            if ti.static(self.moves(shape)):
-                for m in range(start, stop):
-                    at = (e * self.manipulators + m) * (self.tiles * self.lanes) + particle
-                    self.distance[at] = self.end_distance(shape, e, m, x)
 
     @ti.func
     def reduce_distances(self, e, m, group):
@@ -645,7 +617,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):
-        """Terms and distances of a particle of a thread's tile; all lanes of a warp take part."""
+        """Terms of a particle of a thread's tile, and its distances from the moving manipulators; all lanes
+        of a warp take part."""
         if ti.static(len(self.particle_terms) > 0):
             values = ti.Vector.zero(ti.f64, ti.static(len(self.particle_terms)))
             if counts:
@@ -657,7 +630,11 @@ class CudaPhases(OrderPhases, PosePhases):
                     self.add_measure(e, ti.static(len(self.node_terms) + k), total)
         if ti.static(len(self.distance_terms) > 0):
             if counts:
-                self.note_distances(e, particle, x)
+                for shape, start, stop in ti.static(self.shape_ranges):
+                    if ti.static(self.moves(shape)):
+                        for m in range(start, stop):
+                            at = (e * self.manipulators + m) * (self.tiles * self.lanes) + particle
+                            self.distance[at] = self.end_distance(shape, e, m, x)
 
     @ti.func
     def node_terms_thread(self, w, q):

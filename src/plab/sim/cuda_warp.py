@@ -384,22 +384,6 @@ class OrderPhases(WarpPhases):
         base, _fx = self.stencil(self.vector(state, entry, particle % self.lanes))
         return base
 
-    @ti.func
-    def begin_shares(self, e, node, lane):
-        """Convert the counts of a warp's cells to offsets."""
-        count = self.cell_count[node]
-        upto = count
-        for k in ti.static(range(RUN_BITS)):
-            below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
-            if lane >= (1 << k):
-                upto += below
-        total = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), upto, WARP - 1)
-        begin = 0
-        if lane == 0:
-            begin = ti.atomic_add(self.placed[e], total)
-        begin = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), begin, 0)
-        self.cell_count[node] = begin + upto - count
-
     @ti.kernel
     def sort(
         self,
@@ -431,7 +415,20 @@ class OrderPhases(WarpPhases):
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
-                self.begin_shares(e, e * self.nodes + self.linear_in_block(block, r), w % WARP)
+                # Convert the counts of a warp's cells to offsets.
+                node, lane = e * self.nodes + self.linear_in_block(block, r), w % WARP
+                count = self.cell_count[node]
+                upto = count
+                for k in ti.static(range(RUN_BITS)):
+                    below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
+                    if lane >= (1 << k):
+                        upto += below
+                total = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), upto, WARP - 1)
+                begin = 0
+                if lane == 0:
+                    begin = ti.atomic_add(self.placed[e], total)
+                begin = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), begin, 0)
+                self.cell_count[node] = begin + upto - count
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             place = particle

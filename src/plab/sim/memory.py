@@ -128,15 +128,13 @@ def held_bytes(*holders: object) -> int:
     values = [value for holder in holders for value in vars(holder).values()]
     values += [part for value in values if isinstance(value, list) for part in value]
     held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
-    return sum(map(_array_bytes, held.values()))
-
-
-def _array_bytes(data: ti.Field | ti.Ndarray) -> int:
-    if isinstance(data, ti.Ndarray):
-        scalars = math.prod(data.element_shape)
-    else:
-        scalars = data.n * data.m if isinstance(data, ti.MatrixField) else 1
-    return math.prod(data.shape) * scalars * BYTES[data.dtype]
+    total = 0
+    for data in held.values():
+        vector = data.element_shape if isinstance(data, ti.Ndarray) else ()
+        if isinstance(data, ti.MatrixField):
+            vector = data.n, data.m
+        total += math.prod(data.shape) * math.prod(vector) * BYTES[data.dtype]
+    return total
 
 
 def device_bytes(device: str) -> float:

@@ -139,10 +139,25 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
         )
     _users.clear()
+    remove_stale_cache_lock()
     # Taichi prints the device to standard output, which is reserved for the caller.
     with contextlib.redirect_stdout(io.StringIO()):
-        remove_stale_cache_lock()
-        _start_taichi(device, precision, wanted)
+        ti.init(
+            arch=ti.cuda if device == "cuda" else ti.cpu,
+            default_fp=ti.f32 if precision == "float32" else ti.f64,
+            cpu_max_num_threads=wanted,
+            # Square roots in float64 on CUDA lose digits under fast_math.
+            fast_math=device == "cpu" or precision == "float32",
+            # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of
+            # them asserts.
+            advanced_optimization=False,
+            offline_cache=True,
+            # The suite's kernels exceed Taichi's default of 100 MB, and would be evicted and recompiled
+            # repeatedly.
+            offline_cache_max_size_of_files=CACHE_BYTES,
+            # Suppress warnings about a cache in use by another process; kernels are then not cached.
+            log_level=ti.ERROR,
+        )
     clear_kernel_arguments()
     guard_array_release()
     defer_position_lookup()
@@ -170,25 +185,6 @@ def remove_stale_cache_lock() -> None:
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > STALE_LOCK_SECONDS:
             lock.unlink()
-
-
-def _start_taichi(device: str, precision: str, threads: int) -> None:
-    ti.init(
-        arch=ti.cuda if device == "cuda" else ti.cpu,
-        default_fp=ti.f32 if precision == "float32" else ti.f64,
-        cpu_max_num_threads=threads,
-        # Square roots in float64 on CUDA lose digits under fast_math.
-        fast_math=device == "cpu" or precision == "float32",
-        # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of them
-        # asserts.
-        advanced_optimization=False,
-        offline_cache=True,
-        # The suite's kernels exceed Taichi's default of 100 MB, and would be evicted and recompiled
-        # repeatedly.
-        offline_cache_max_size_of_files=CACHE_BYTES,
-        # Suppress warnings about a cache in use by another process; kernels are then not cached.
-        log_level=ti.ERROR,
-    )
 
 
 def cuda_driver() -> ctypes.CDLL | None:

@@ -225,7 +225,9 @@ class Tape:
         for t in reversed(range(steps)):
             k = t // self._length
             if k < last and (t + 1) % self._length == 0:
-                self._recompute(k, actions, poses)
+                self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
+                for again in range(k * self._length, (k + 1) * self._length):
+                    self._keep_step(again, actions, poses, known=True)
             history, slot = self._place(t)
             if add is not None:
                 add(t, history, slot + engine.substeps, self.bar)
@@ -238,11 +240,6 @@ class Tape:
                 engine.move_back(self.bar, self._spare_bar, self._moves, t)
                 self.bar, self._spare_bar = self._spare_bar, self.bar
         return actions_bar
-
-    def _recompute(self, k: int, actions: ti.Ndarray, poses: ti.Ndarray) -> None:
-        self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
-        for t in range(k * self._length, (k + 1) * self._length):
-            self._keep_step(t, actions, poses, known=True)
 
 
 # -- callbacks between environment steps ------------------------------------------------------------------
