@@ -15,6 +15,7 @@ from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.scenes import Scene
+from toy_runner import COARSE
 
 TASKS = suite_tasks()
 MOMENTS = Path(__file__).parent / "target_moments.csv"
@@ -76,3 +77,13 @@ def test_targets_are_those_that_were_published(task, device):
     columns = ["x", "y", "z", "std_x", "std_y", "std_z", "distance"]
     np.testing.assert_allclose(table[columns], expected[columns], atol=2e-4)
     np.testing.assert_allclose(table["moved"], expected["moved"], atol=2e-3)
+
+
+def test_thin_manipulators_are_warned_of(caplog) -> None:
+    """Those that fit between two nodes, by number and thickness."""
+    for radius, lines in ((0.01, 1), (0.02, 0)):
+        caplog.clear()
+        Problem([load_config(["task=Pinch", *COARSE, f"task.manipulators.ball.size=[{radius}]"])])
+        found = [line for line in caplog.messages if "passes through bodies" in line]
+        assert len(found) == lines
+        assert all(line.startswith("manipulators[0] is 0.02 thin") for line in found)
