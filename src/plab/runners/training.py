@@ -279,12 +279,7 @@ class PolicyRunner(Runner):
             raise TogetherError("a run has failed")
         training, start = self.policies, time.perf_counter()
         before = training.steps
-
-        def report() -> None:
-            pace = (training.steps - before) * len(tracks) / (time.perf_counter() - start)
-            self.report(training.episodes, f"{pace:.0f} steps/s {self._shown}")
-
-        training.report = report
+        training.report = lambda: self.report(training.episodes, self._shown)
         # The first evaluation, of the initial policies, compiles the kernels.
         if tracks[0].iteration > 0:
             self.enter("optimise")
