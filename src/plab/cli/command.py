@@ -155,10 +155,10 @@ def sources_and_words(
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     """Return the finished runs that words choose, all of one protocol; ResultsError if there are none."""
-    from plab.results.schema import ResultsError
+    from plab.results.schema import NAMES, ResultsError
     from plab.results.table import rows
 
-    chosen = select(words, ("task", "variant", "method", "seed"))
+    chosen = select(words, NAMES)
     found, _ = rows(sources)
     fitting = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
     one_protocol(row.config for row in fitting)

@@ -76,12 +76,11 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
     try:
         content = path.read_bytes()
         table = pd.read_csv(io.BytesIO(content), comment="#")
+        table = table[[*benchmark.columns, *table.columns.difference(benchmark.columns)]]
     except FileNotFoundError:
         raise ResultsError(f"there is no {path}: {advice}") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): {advice}") from error
-    if missing := [name for name in benchmark.columns if name not in table]:
-        raise ResultsError(f"{path} lacks {', '.join(missing)}: {advice}")
     lines = content.decode(errors="replace").splitlines()
     said = [line[1:].strip() for line in lines if line.startswith("#")]
     table.attrs["origin"] = [f"Measured: {path}, SHA-256 {hashlib.sha256(content).hexdigest()}", *said]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -70,7 +71,7 @@ def faults(run: RunResult) -> list[str]:
     """Return the faults of a readable run."""
     found: list[str] = []
 
-    def require(fits: bool, reason: str) -> None:
+    def require(fits: Any, reason: str) -> None:
         if not fits:
             found.append(reason)
 
@@ -85,7 +86,7 @@ def faults(run: RunResult) -> list[str]:
     return found
 
 
-def _check_iterations(run: RunResult, require: Callable[[bool, str], None]) -> None:
+def _check_iterations(run: RunResult, require: Callable[[Any, str], None]) -> None:
     table, family = run.columns, known_family(run.config["method"]["family"])
     common = (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
@@ -116,7 +117,7 @@ def _check_iterations(run: RunResult, require: Callable[[bool, str], None]) -> N
     require((np.abs(actions) <= 1.0).all(), "best actions leave [-1, 1]")
 
 
-def _check_evaluation(run: RunResult, require: Callable[[bool, str], None]) -> None:
+def _check_evaluation(run: RunResult, require: Callable[[Any, str], None]) -> None:
     values, size, method = run.evaluation, run.config["sim"]["grid_size"], run.config["method"]
     for name, mass in run.masses.items():
         fits = mass.shape == (size,) * 3 and np.isfinite(mass).all()

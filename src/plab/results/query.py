@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config.selection import Selection, leaves, lookup
 from plab.errors import ArgumentError
-from plab.results.schema import ResultsError
+from plab.results.schema import NAMES, ResultsError
 from plab.results.table import COLUMNS, Row, read_curves, rows, sources_of, warn_of
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def scores(
 
     found, unreadable = rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
-    columns = list(dict.fromkeys((*_NAMES, *_SETTINGS, "status", "score", *keys)))
+    columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
     table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
     if strange := [key for key in keys if fitting and table[key].map(lambda value: value is None).all()]:
         raise ArgumentError(f"no run has '{strange[0]}': give columns of plab.results.load, or dotted keys")
@@ -100,15 +100,13 @@ def scores(
         raise ArgumentError(
             f"there is no column '{missing[0]}' to sort by; choose from: {', '.join(columns)}"
         )
-    by = [*sort, *(name for name in _NAMES if name not in sort)]
+    by = [*sort, *(name for name in NAMES if name not in sort)]
     directions = [not descending] * len(sort) + [True] * (len(by) - len(sort))
     ordered = table.sort_values(by, ascending=directions, key=_comparable, kind="stable")
     return ordered.reset_index(drop=True), unreadable
 
 
 # ---------------------------------------------------------------------------------------------------- details
-
-_NAMES = ("task", "variant", "method", "seed")
 
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
 """Columns by configuration key that must agree within a mean."""

@@ -23,6 +23,9 @@ SCHEMA_VERSION = 2
 
 STATUSES = ("running", "finished", "failed", "stopped")
 
+NAMES = ("task", "variant", "method", "seed")
+"""Columns that name a run in tables."""
+
 PARTIAL_SUFFIX = ".partial.h5"
 REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"

@@ -16,13 +16,11 @@ from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import columns_of, opened, split_archive, summary_of
 from plab.results.running import held
+from plab.results.schema import NAMES
 from plab.results.table import rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""
-
-NAMES = ("task", "variant", "method", "seed")
-"""Identity of a run."""
 
 Key: TypeAlias = tuple[str, str, str, str]
 """Task, variant, method and seed of a run."""
