@@ -60,12 +60,8 @@ class BodyConfig(ranges.Section):
     parameters: dict[str, float] = field(default_factory=dict)
 
     def build(self, particles_scale: float = 1.0) -> Body:
-        """Return the scene's body, with the number of particles scaled by ``particles_scale``, at least one.
-
-        Raises:
-            plab.scenes.SceneError: If a mesh has no file, or another shape has one.
-            plab.files.ShapeError: If the file is invalid.
-        """
+        """Return the scene's body, with the number of particles scaled, at least one; errors are those of
+        :func:`plab.scenes.make_body`."""
         particles = max(1, round(self.particles * particles_scale))
         material = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law", "parameters")}
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256, **material)

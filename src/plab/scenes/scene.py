@@ -520,11 +520,7 @@ class Scene:
         return facts
 
     def validate(self) -> None:
-        """Check that the scene can be simulated.
-
-        Raises:
-            SceneError: If it cannot; the message names the field and a valid value.
-        """
+        """Raise SceneError, which names the field and a valid value, if the scene cannot be simulated."""
         _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):

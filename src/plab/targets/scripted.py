@@ -100,11 +100,8 @@ class Script(Recipe):
         return {key: value for key, value in values.items() if value is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
-        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A].
-
-        Raises:
-            TargetError: If a parameter has a wrong value, or no sampled path fits into an episode.
-        """
+        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; TargetError if a parameter
+        has a wrong value, or no sampled path fits into an episode."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         rng, movers = np.random.default_rng(self.seed), [m for m in scene.tools if m.action_dim]
