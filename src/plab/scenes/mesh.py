@@ -29,6 +29,9 @@ _BLOCK = 8192
 _PAIRS = 1 << 21
 """Number of point-triangle pairs tested at once, limited by memory."""
 
+_MARGIN = 1e-12
+"""Margin of the bounding box of a triangle, for rounding errors."""
+
 _TRIED = 1 << 15
 """Number of sample points to compare the enclosed volume with that of the faces."""
 
@@ -116,20 +119,25 @@ class Mesh:
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return which points, shape [point, 3], are inside, by their winding numbers; bool, shape
         [point]."""
-        from scipy.spatial import KDTree
-
-        winding = np.zeros(len(points), dtype=np.int64)
-        # Seen along y, a point can only be in a triangle whose circle around the centroid holds it.
+        winding, flat = np.zeros(len(points), dtype=np.int64), points[:, ::2]
         corners = self.vertices[:, ::2][self.faces]
-        middle = corners.mean(axis=1)
-        reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1) * (1 + 1e-9) + 1e-12
-        tree = KDTree(points[:, ::2])
-        counts = tree.query_ball_point(middle, reach, return_length=True)
+        low, high = corners.min(axis=1) - _MARGIN, corners.max(axis=1) + _MARGIN
+        # Along one axis, the points between the ends of a triangle follow one another.
+        orders = flat.argsort(axis=0)
+        first, last = (
+            np.stack([np.searchsorted(flat[orders[:, k], k], bound[:, k]) for k in (0, 1)])
+            for bound in (low, high)
+        )
+        axis = (last - first).sum(axis=1).argmin()
+        order, first, counts = orders[:, axis], first[axis], (last - first)[axis]
         ends = np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS)) + 1
-        for faces in filter(len, np.split(np.arange(len(counts)), ends)):
-            point = np.concatenate(tree.query_ball_point(middle[faces], reach[faces])).astype(np.int64)
-            face = self.faces[np.repeat(faces, counts[faces])]
-            met, height, sense = self._crossings(points[point][:, ::2], face)
+        for faces in np.split(np.arange(len(counts)), ends):
+            face, before = np.repeat(faces, counts[faces]), np.cumsum(counts[faces]) - counts[faces]
+            nth = np.arange(len(face)) - np.repeat(before, counts[faces])
+            point = order[first[face] + nth]
+            close = ((flat[point] >= low[face]) & (flat[point] <= high[face])).all(axis=1)
+            point, face = point[close], face[close]
+            met, height, sense = self._crossings(flat[point], self.faces[face])
             point = point[met]
             above = height > points[point, 1]
             np.add.at(winding, point[above], sense[above])
