@@ -112,7 +112,7 @@ class Renderer:
             ghost = self._target.copy()
             ghost.points -= _NEAR * ghost.point_normals
             look = {"color": TARGET_COLOR, "opacity": _GHOST_OPACITY, "culling": "back"}
-            plotter.add_mesh(ghost, reset_camera=False, **look, **_GLASS)
+            plotter.add_mesh(ghost, reset_camera=False, render=False, **look, **_GLASS)
         return self._draw()
 
     def target(self, poses: np.ndarray) -> np.ndarray:
@@ -140,10 +140,10 @@ class Renderer:
         self._plotter.clear_actors()
         # It hides what is below, and its lines are slightly above it.
         floor = pv.Plane(center=(0.5, 0.0, 0.5), direction=(0.0, 1.0, 0.0), i_size=1.8, j_size=1.8)
-        self._plotter.add_mesh(floor, color=PAPER, lighting=False, reset_camera=False)
+        self._plotter.add_mesh(floor, color=PAPER, lighting=False, reset_camera=False, render=False)
         lines = pv.line_segments_from_points(floor_lines(3e-3))
         look = {"opacity": 0.16, "line_width": 1.3, "lighting": False}
-        self._plotter.add_mesh(lines, color=INK, reset_camera=False, **look)
+        self._plotter.add_mesh(lines, color=INK, reset_camera=False, render=False, **look)
         for number, (pose, own) in enumerate(zip(np.asarray(poses, np.float64), self._parts, strict=True)):
             moves = self._scene.manipulators[number].action_dim > 0
             for part in own if moving or not moves else ():
@@ -155,11 +155,11 @@ class Renderer:
     def _add(self, mesh: pv.PolyData, name: str, **look: Any) -> None:
         """Add a mesh and its shadow on the floor."""
         assert self._plotter is not None
-        self._plotter.add_mesh(mesh, name=name, reset_camera=False, **look)
+        self._plotter.add_mesh(mesh, name=name, reset_camera=False, render=False, **look)
         shadow = mesh.copy()
         shadow.points[:, 1] = np.maximum(shadow.points[:, 1], 0.0)
         shadow.transform(self._flattened, inplace=True)
-        self._plotter.add_mesh(shadow, name=f"shadow of {name}", reset_camera=False, **_SHADOW)
+        self._plotter.add_mesh(shadow, name=f"shadow of {name}", reset_camera=False, render=False, **_SHADOW)
 
     def _draw(self) -> np.ndarray:
         assert self._plotter is not None
