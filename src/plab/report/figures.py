@@ -23,14 +23,7 @@ from plab.config.selection import lookup
 from plab.report.collect import Runs
 from plab.report.methods import method
 from plab.report.reference import origin, paper_table
-from plab.report.statistics import (
-    Rows,
-    Series,
-    band,
-    improvement,
-    interquartile_mean,
-    shared_strata,
-)
+from plab.report.statistics import Rows, Series, band, improvement, interquartile_mean, shared_strata
 from plab.report.tables import (
     AGREES,
     TOLERANCE,

@@ -23,14 +23,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
-from plab.report.statistics import (
-    AXES,
-    Rows,
-    Series,
-    Summary,
-    band,
-    load_series,
-)
+from plab.report.statistics import AXES, Rows, Series, Summary, band, load_series
 from plab.report.tables import Cell, compare, ordered_tasks, settings_note
 from plab.report.writing import origin
 from plab.results.run_file import replace_file

@@ -18,12 +18,7 @@ from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.collecting import submission_files
-from plab.submissions.submission import (
-    UNSEEN,
-    Card,
-    SubmissionError,
-    read,
-)
+from plab.submissions.submission import UNSEEN, Card, SubmissionError, read
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_verification
 
 PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
