@@ -316,7 +316,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
             for lane in range(self.lanes_of(tile)):
                 x = self.vector(state, source, lane)
                 for shape, start, stop in ti.static(self.shape_ranges):
-                    if ti.static(self.acts(shape)):
+                    if ti.static(self.moves(shape)):
                         for m in range(start, stop):
                             x_bar, pose_bar = self.distance_gradient(shape, e, m, tile * self.lanes + lane, x)
                             # Written out, because += on a field is an atomic.

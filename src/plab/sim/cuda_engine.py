@@ -209,7 +209,7 @@ class CudaEngine(CudaPhases):
                 number, count = q // DISTANCE_GROUPS, ti.static(max(1, self.manipulators))
                 e, m = number // count, number % count
                 for shape, start, stop in ti.static(self.shape_ranges):
-                    if ti.static(self.acts(shape)):
+                    if ti.static(self.moves(shape)):
                         if start <= m < stop:
                             self.reduce_distances(e, m, q % DISTANCE_GROUPS)
         for e in range(self.batch):

@@ -208,50 +208,39 @@ class CudaPhases(OrderPhases, PosePhases):
     # -- material ------------------------------------------------------------------------------------
 
     @ti.func
+    def has_law(self, p: ti.template(), number: ti.template()):
+        """Return True if a particle with coefficients ``p`` has the law of a number."""
+        if ti.static(len(self.laws) > 1):
+            return p[self.coefficients] == ti.cast(number, self.real)
+        else:
+            return True
+
+    @ti.func
     def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """Material update of one particle, whose new F is stored if ``update``; returns A, row by row."""
         out = ti.Vector.zero(self.real, 9)
         p = self.parameters_of_particle(e, source, lane)
         for number in ti.static(range(len(self.laws))):
-            if ti.static(len(self.laws) == 1):
-                out = self.law_particle(state, source, target, lane, e, p, number, update)
-            else:
-                if p[self.coefficients] == ti.cast(number, self.real):
-                    out = self.law_particle(state, source, target, lane, e, p, number, update)
-        return out
-
-    @ti.func
-    def law_particle(
-        self,
-        state: ti.template(),
-        source,
-        target,
-        lane,
-        e,
-        p: ti.template(),
-        number: ti.template(),
-        update: ti.template(),
-    ):
-        out = ti.Vector.zero(self.real, 9)
-        a = variables(self.real, self.load(state, source + AT_C, lane, 9))
-        f_new = variables(self.real, self.load(state, source + AT_F, lane, 9))
-        coefficients = variables(self.real, [p[i] for i in range(self.laws[number].size)])
-        constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
-        function = ti.static(self.function(number, "particle"))
-        served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(number)):
-            ends = variables(self.real, ti.static(self.range_of_series()))
-            function(*a, *f_new, *coefficients, *constants, *ends, served)
-        else:
-            function(*a, *f_new, *coefficients, *constants)
-        if served > 0.0:
-            for i in ti.static(range(9)):
-                out[i] = a[i]
-                if ti.static(update):
-                    state[target + AT_F + i][lane] = f_new[i]
-        else:
-            if ti.static(self.scheduled(number)):
-                out = self.spectral_material(state, source, target, lane, e, update)
+            if self.has_law(p, number):
+                a = variables(self.real, self.load(state, source + AT_C, lane, 9))
+                f_new = variables(self.real, self.load(state, source + AT_F, lane, 9))
+                coefficients = variables(self.real, [p[i] for i in range(self.laws[number].size)])
+                constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+                function = ti.static(self.function(number, "particle"))
+                served = ti.cast(1.0, self.real)
+                if ti.static(self.scheduled(number)):
+                    ends = variables(self.real, ti.static(self.range_of_series()))
+                    function(*a, *f_new, *coefficients, *constants, *ends, served)
+                else:
+                    function(*a, *f_new, *coefficients, *constants)
+                if served > 0.0:
+                    for i in ti.static(range(9)):
+                        out[i] = a[i]
+                        if ti.static(update):
+                            state[target + AT_F + i][lane] = f_new[i]
+                else:
+                    if ti.static(self.scheduled(number)):
+                        out = self.spectral_material(state, source, target, lane, e, update)
         return out
 
     def range_of_series(self) -> list[float]:
@@ -265,49 +254,34 @@ class CudaPhases(OrderPhases, PosePhases):
         """Adjoint of :meth:`material_particle`, given that of A."""
         p = self.parameters_of_particle(e, source, lane)
         for number in ti.static(range(len(self.laws))):
-            if ti.static(len(self.laws) == 1):
-                self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, number)
-            else:
-                if p[self.coefficients] == ti.cast(number, self.real):
-                    self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, number)
-
-    @ti.func
-    def law_particle_adjoint(
-        self,
-        state: ti.template(),
-        source,
-        bar: ti.template(),
-        target,
-        a_bar: ti.template(),
-        lane,
-        e,
-        p: ti.template(),
-        number: ti.template(),
-    ):
-        c_out = variables(self.real, self.load(state, source + AT_C, lane, 9))
-        f_out = variables(self.real, self.load(state, source + AT_F, lane, 9))
-        a, b = variables(self.real, a_bar), variables(self.real, self.load(bar, target + AT_F, lane, 9))
-        p_bar = variables(self.real, [p[i] for i in range(self.laws[number].size)])
-        constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
-        function = ti.static(self.function(number, "particle_adjoint"))
-        served = ti.cast(1.0, self.real)
-        if ti.static(self.scheduled(number)):
-            ends = variables(self.real, ti.static(self.range_of_series()))
-            function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
-        else:
-            function(*c_out, *f_out, *a, *b, *p_bar, *constants)
-        if served > 0.0:
-            if ti.static(self.full_gradient):
-                if ti.static(self.mixed):
-                    self.accumulate_particle(e, source, lane, p_bar)
+            if self.has_law(p, number):
+                c_out = variables(self.real, self.load(state, source + AT_C, lane, 9))
+                f_out = variables(self.real, self.load(state, source + AT_F, lane, 9))
+                a, b = (
+                    variables(self.real, a_bar),
+                    variables(self.real, self.load(bar, target + AT_F, lane, 9)),
+                )
+                p_bar = variables(self.real, [p[i] for i in range(self.laws[number].size)])
+                constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+                function = ti.static(self.function(number, "particle_adjoint"))
+                served = ti.cast(1.0, self.real)
+                if ti.static(self.scheduled(number)):
+                    ends = variables(self.real, ti.static(self.range_of_series()))
+                    function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
                 else:
-                    self.accumulate_material(e, p_bar)
-            for i in ti.static(range(9)):
-                bar[target + AT_C + i][lane] = c_out[i]
-                bar[target + AT_F + i][lane] = f_out[i]
-        else:
-            if ti.static(self.scheduled(number)):
-                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
+                    function(*c_out, *f_out, *a, *b, *p_bar, *constants)
+                if served > 0.0:
+                    if ti.static(self.full_gradient):
+                        if ti.static(self.mixed):
+                            self.accumulate_particle(e, source, lane, p_bar)
+                        else:
+                            self.accumulate_material(e, p_bar)
+                    for i in ti.static(range(9)):
+                        bar[target + AT_C + i][lane] = c_out[i]
+                        bar[target + AT_F + i][lane] = f_out[i]
+                else:
+                    if ti.static(self.scheduled(number)):
+                        self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     @ti.func
     def accumulate_material(self, row, bars: ti.template()):
@@ -671,7 +645,7 @@ class CudaPhases(OrderPhases, PosePhases):
         x = self.vector(state, self.tile_entry(slot, e, tile), lane)
         entry = self.tile_entry(0, e, tile)
         for shape, start, stop in ti.static(self.shape_ranges):
-            if ti.static(self.acts(shape)):
+            if ti.static(self.moves(shape)):
                 for m in range(start, stop):
                     x_bar, pose_bar = self.distance_gradient(shape, e, m, particle, x)
                     counts = particle < self.particles

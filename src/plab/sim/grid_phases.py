@@ -143,7 +143,7 @@ class GridPhases(Storage):
         strength = self.strength(e, d)
         if strength > 0.0:
             # Contact with static manipulators does not depend on actions.
-            if ti.static(MANIPULATOR_SHAPES[shape].moves):
+            if ti.static(self.moves(shape)):
                 if self.touched[e] == 0:
                     self.touched[e] = 1
             normal = self.out_of_frame(shape, e, s, m, n_local)

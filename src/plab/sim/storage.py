@@ -131,28 +131,21 @@ class Storage:
         self.series = Series.for_precision(runtime.precision)
         if singular_values:
             self.series = replace(self.series, z_squared_max=-1.0)
-        self._set_grid(first)
-        self._set_manipulators(first)
-        self._allocate()
-
-    def _set_grid(self, scene: Scene) -> None:
-        self.n = scene.grid_size
-        self.dx = scene.dx
-        self.inv_dx = float(scene.grid_size)
-        self.dt = scene.dt
-        self.mass = scene.particle_mass
-        self.stress_scale = -scene.dt * scene.particle_volume * 4.0 * self.inv_dx**2
-        self.x_max = 1.0 - 3.0 * scene.dx
+        self.n = first.grid_size
+        self.dx = first.dx
+        self.inv_dx = float(first.grid_size)
+        self.dt = first.dt
+        self.mass = first.particle_mass
+        self.stress_scale = -first.dt * first.particle_volume * 4.0 * self.inv_dx**2
+        self.x_max = 1.0 - 3.0 * first.dx
         # Rounding of the base node: the release truncates toward zero, plab rounds down.
-        self.lowest_base = 0 if scene.floor_stencil == "release" else -1
+        self.lowest_base = 0 if first.floor_stencil == "release" else -1
         self.blocks_per_axis = -(-self.n // BLOCK)
         self.axis = self.blocks_per_axis * BLOCK
         self.nodes = self.axis**3
         self.blocks = self.blocks_per_axis**3
-
-    def _set_manipulators(self, scene: Scene) -> None:
-        manipulators = scene.manipulators
-        self.rotations_as_given = scene.digits_convention == "release"
+        manipulators = first.manipulators
+        self.rotations_as_given = first.digits_convention == "release"
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
         require_surfaces(self.shapes)
@@ -163,6 +156,7 @@ class Storage:
         # Consecutive manipulators of one shape share one loop and its compiled body.
         groups = [list(group) for _, group in groupby(range(self.manipulators), key=self.shapes.__getitem__)]
         self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)
+        self._allocate()
 
     def moves(self, shape: str) -> bool:
         """Return True if manipulators of this shape can move; evaluated at compile time, like the methods
@@ -260,24 +254,18 @@ class Storage:
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write floor friction, gravity and material of all environments."""
-        tables = [self._coefficients(s) for s in scenes]
-        rows = [
-            [s.floor_friction, *s.gravity, *t[0][: self.coefficients]]
-            for s, t in zip(scenes, tables, strict=True)
-        ]
-        self.write(self.material, rows)
+        # Each material's coefficients, padded, and the number of its law.
+        tables = np.zeros((self.batch, self.materials, self.coefficients + 1))
+        for table, scene in zip(tables, scenes, strict=True):
+            for row, material in zip(table, scene.materials[: self.materials], strict=True):
+                own = material.kind.coefficients_of(material.values)
+                row[: len(own)], row[-1] = own, self.laws.index(material.kind)
+        shared = [[scene.floor_friction, *scene.gravity] for scene in scenes]
+        self.write(self.material, np.concatenate([shared, tables[:, 0, :-1]], axis=1))
         if self.mixed:
             columns = np.arange(self.place_rows).reshape(1, 1, -1, 1)
             environments = np.arange(self.batch).reshape(-1, 1, 1, 1)
-            self.write(self.place_material, np.array(tables)[environments, self._bodies, columns])
-
-    def _coefficients(self, scene: Scene) -> list[list[float]]:
-        """Return each material's coefficients, padded, and the number of its law."""
-        rows = []
-        for material in scene.materials[: self.materials]:
-            row = material.kind.coefficients_of(material.values)
-            rows.append([*row, *[0.0] * (self.coefficients - len(row)), self.laws.index(material.kind)])
-        return [row[: self.place_rows] for row in rows]
+            self.write(self.place_material, tables[environments, self._bodies, columns])
 
     @property
     def place_rows(self) -> int:

@@ -263,7 +263,7 @@ class TermPhases(Storage):
         for k, _column, term in ti.static(self.distance_terms):
             if ti.static(term.nearest_only):
                 for shape, start, stop in ti.static(self.shape_ranges):
-                    if ti.static(self.acts(shape)):
+                    if ti.static(self.moves(shape)):
                         for m in range(start, stop):
                             particle = ti.cast(self.tally[k, e, m][1], ti.i32)
                             tile = particle // self.lanes
@@ -287,11 +287,6 @@ class TermPhases(Storage):
                 x_bar += along_x
                 pose_bar += along_pose
         return x_bar, pose_bar
-
-    def acts(self, shape: str) -> bool:
-        """Return True if a shape's distances count in the loss, that is, if it can move; evaluated at compile
-        time."""
-        return MANIPULATOR_SHAPES[shape].moves
 
     @property
     def beyond_nearest(self) -> bool:
@@ -320,7 +315,7 @@ class TermPhases(Storage):
         for k, column, term in ti.static(self.distance_terms):
             total = ti.cast(0.0, ti.f64)
             for shape, start, stop in ti.static(self.shape_ranges):
-                if ti.static(self.acts(shape)):
+                if ti.static(self.moves(shape)):
                     for m in range(start, stop):
                         tally = self.tally_part[k, e, 0, m]
                         for c in range(1, self.shares):
