@@ -109,10 +109,8 @@ class CameraSensor:
         )
         out = {}
         for name in names or ("depth", "segmentation", "rgb"):
-            if name == "depth":
-                out[name] = self._filled(self._write_depth, np.float32, like)
-            else:
-                out[name] = self._filled(self._write_labels, np.int32, like)
+            depth = name == "depth"
+            out[name] = self._filled(self._write, np.float32 if depth else np.int32, like, depth)
             if name == "rgb":
                 light = self._filled(self._write_light, np.float32, like, self._frame, camera.focal_length)
                 out[name] = _colours(out[name], light)
@@ -141,7 +139,6 @@ class CameraSensor:
 
     @ti.func
     def depth_of(self, key):
-        """Depth of a key."""
         return ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
 
     @ti.func
@@ -195,7 +192,6 @@ class CameraSensor:
         focal: ti.f32,
         near: ti.f32,
     ):
-        """Draw the balls of the particles."""
         for q in range(self.engine.batch * self.engine.tiles * self.engine.lanes):
             e, place = self.engine.particle_of(q)
             if place < self.engine.particles:
@@ -227,14 +223,12 @@ class CameraSensor:
                                 ti.atomic_min(keys[pixel], self.key(hit, label))
 
     @ti.kernel
-    def _write_depth(self, keys: Array, out: Array):
+    def _write(self, keys: Array, depth: ti.template(), out: Array):
         for q in range(self.batch * self.pixels):
-            out[q] = self.depth_of(keys[q])
-
-    @ti.kernel
-    def _write_labels(self, keys: Array, out: Array):
-        for q in range(self.batch * self.pixels):
-            out[q] = ti.cast(keys[q] & 0xFFFF, ti.i32)
+            if ti.static(depth):
+                out[q] = self.depth_of(keys[q])
+            else:
+                out[q] = ti.cast(keys[q] & 0xFFFF, ti.i32)
 
     @ti.func
     def point(self, keys: ti.template(), frame: ti.template(), e, row, column, focal):

@@ -67,7 +67,6 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def call(self, unit: ti.template(), name: ti.template(), at: ti.template(), numbers: ti.template()):
-        """Call a function of the bitcode."""
         ti.static(self.function(unit, name))(*self.arguments(unit, at, numbers))
 
     @ti.func
@@ -314,7 +313,6 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
-        """Return True if a particle has the law of a number."""
         if ti.static(len(self.laws) > 1):
             row = entry9 // 9 * ti.static(self.place_rows) + self.coefficients
             return self.place_material[row][lane] == ti.cast(number, self.real)

@@ -13,9 +13,8 @@ import ctypes
 from plab.sim.compiler import ti
 from plab.sim.cuda_phases import DISTANCE_GROUPS, POSE_SHARE, RESIDENT_BLOCK, CudaPhases
 from plab.sim.cuda_warp import BLOCK_WARPS, NODE_BITS, NODE_STRIDE, WARP_BLOCK, WARP_NUMBERS
-from plab.sim.particle_phases import SIZES
 from plab.sim.runtime import cuda_driver
-from plab.sim.storage import STATE
+from plab.sim.storage import BYTES, STATE
 from plab.sim.tensors import Array
 
 THREADS_MAX = 1 << 17
@@ -64,7 +63,7 @@ class CudaEngine(CudaPhases):
         self.pose_threads = self.batch * max(1, self.manipulators)
         # Threads of as many blocks as move all poses.
         self.frame_threads = -(-self.pose_threads // POSE_SHARE) * RESIDENT_BLOCK
-        shared = SIZES[self.real] * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
+        shared = BYTES[self.real] * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
         # A lower bound on the resident blocks per multiprocessor.
         fitting = max(1, min(RESIDENT_BLOCKS, device_attribute(SHARED_BYTES) // shared))
         blocks = device_attribute(MULTIPROCESSORS) * fitting
@@ -78,7 +77,6 @@ class CudaEngine(CudaPhases):
 
     @property
     def reduction_threads(self) -> int:
-        """Number of threads that reduce distances."""
         return DISTANCE_GROUPS * self.batch * self.manipulators if self.distance_terms else 0
 
     @property
@@ -305,7 +303,6 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def export_mass(self, out: Array):
-        """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.mass_blocks))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
@@ -315,7 +312,6 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def copy_slot(self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32):
-        """Copy the particle state of all environments between time slots."""
         size = self.batch * self.tiles * STATE
         for i in range(size * self.lanes):
             entry, lane = i // self.lanes, i % self.lanes

@@ -68,7 +68,6 @@ class CudaPhases(OrderPhases, PosePhases):
         return int(min(1 << (self.batch * self.nodes).bit_length(), 1 << 31) - 1)
 
     def attach(self, terms: Sequence[Any]) -> None:
-        """Attach the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
         super().attach(terms)
         threads = self.batch * self.tiles * self.lanes
         moving = self.distance_terms and any(self.moves(shape) for shape in self.shapes)
@@ -88,7 +87,6 @@ class CudaPhases(OrderPhases, PosePhases):
         self.material_sums = self.sums(self.material_bar.shape[0] * self.coefficients)
 
     def allocate_impulses(self) -> None:
-        """Allocate the sums of impulses, before the first kernel is compiled."""
         self.sums_impulses = True
         self.impulse_sums = self.sums(self.batch * max(1, self.manipulators) * 3)
 
@@ -244,7 +242,6 @@ class CudaPhases(OrderPhases, PosePhases):
         return out
 
     def range_of_series(self) -> list[float]:
-        """Return the range of the series for von Mises plasticity."""
         return [self.series.z_squared_max, self.series.j_min, self.series.j_max]
 
     @ti.func

@@ -119,7 +119,6 @@ class SumPhases(Storage):
 
     @ti.func
     def add_up(self, sums: ti.template(), at, value):
-        """Add a float64 to a sum."""
         if ti.static(self.deterministic):
             first = at * ti.static(len(WORD_UNITS) + 1)
             if ti.abs(value) < LARGEST_TERM:

@@ -12,8 +12,8 @@ depends on timing.
 from plab.sim.compiler import ti
 from plab.sim.cuda_sums import SumPhases
 from plab.sim.grid_phases import GridPhases
-from plab.sim.particle_phases import SIZES, ParticlePhases
-from plab.sim.storage import BLOCK_BITS, STATE
+from plab.sim.particle_phases import ParticlePhases
+from plab.sim.storage import BLOCK_BITS, BYTES, STATE
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 
@@ -50,7 +50,6 @@ NODE_STRIDE = 5
 
 @ti.func
 def packed(a, b):
-    """Two float32 as one 64-bit number."""
     low = ti.cast(ti.cast(ti.bit_cast(a, ti.i32), ti.u32), ti.i64)
     return low | (ti.cast(ti.bit_cast(b, ti.i32), ti.i64) << 32)
 
@@ -96,7 +95,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def node_address(self, grid: ti.template(), node):
-        return ti.get_addr(grid, 0) + ti.static(4 * SIZES[self.real]) * ti.cast(node, ti.u64)
+        return ti.get_addr(grid, 0) + ti.static(4 * BYTES[self.real]) * ti.cast(node, ti.u64)
 
     @ti.func
     def node_slope(self, grid: ti.template(), node):
@@ -133,7 +132,6 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def linear_in_block(self, block, r):
-        """Linear index of node r of a block within one grid."""
         return self.linear(self.node_of_block(block, r))
 
     @ti.func

@@ -15,14 +15,11 @@ from pathlib import Path
 from plab.scenes import Scene, SceneError
 from plab.sim.compiler import ti
 from plab.sim.runtime import cuda_driver
-from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
+from plab.sim.storage import BLOCK, BYTES, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 """Largest size of an array of states. Taichi uses 32-bit indices; on the CPU see
 :data:`plab.sim.storage.STATE_MASK`."""
-
-BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
-"""Bytes of a number by its type."""
 
 
 def environment_bytes(

@@ -19,11 +19,8 @@ from plab.sim.spectral import (
     spectral_return_map,
     spectral_return_map_adjoint,
 )
-from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, GROUND, STATE, STATE_MASK, Storage
+from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, BYTES, GROUND, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
-
-SIZES = {ti.f32: 4, ti.f64: 8}
-"""Bytes of a number."""
 
 TYPE_SUFFIXES = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
 """Suffixes of the names of bitcode functions."""
@@ -125,12 +122,12 @@ class ParticlePhases(Storage):
     @ti.func
     def lane_in(self, field: ti.template(), entry, lane):
         """Address of a particle's number in a lane vector of a field."""
-        return ti.get_addr(field, [entry]) + ti.u64(lane * ti.static(SIZES[self.real]))
+        return ti.get_addr(field, [entry]) + ti.u64(lane * ti.static(BYTES[self.real]))
 
     @ti.func
     def lane_of(self, state_at, entry, lane):
         """Address of a particle's number in a lane vector of an array that begins at ``state_at``."""
-        return state_at + ti.u64(entry * self.lanes + lane) * ti.static(SIZES[self.real])
+        return state_at + ti.u64(entry * self.lanes + lane) * ti.static(BYTES[self.real])
 
     @ti.kernel
     def observe(self, state: Array, slot: ti.i32, order: Array, stride: ti.i32, out: Array):

@@ -20,7 +20,6 @@ SINGULAR_VALUE_MIN = 0.05
 
 @ti.func
 def product(a: ti.template(), b: ti.template()):
-    """A B."""
     return ti.Matrix(
         [[a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] for j in range(3)] for i in range(3)]
     )
@@ -28,7 +27,6 @@ def product(a: ti.template(), b: ti.template()):
 
 @ti.func
 def product_tn(a: ti.template(), b: ti.template()):
-    """A^T B."""
     return ti.Matrix(
         [[a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j] for j in range(3)] for i in range(3)]
     )
@@ -36,7 +34,6 @@ def product_tn(a: ti.template(), b: ti.template()):
 
 @ti.func
 def product_nt(a: ti.template(), b: ti.template()):
-    """A B^T."""
     return ti.Matrix(
         [[a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] for j in range(3)] for i in range(3)]
     )

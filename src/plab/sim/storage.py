@@ -85,6 +85,9 @@ GROUND = 4
 LANES = {"cpu": 8, "cuda": 32}
 """Particles per tile."""
 
+BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
+"""Bytes of a number by its type."""
+
 PIECE = 1 << 21
 """Entries of a field that are copied between host and device at a time."""
 
@@ -269,7 +272,6 @@ class Storage:
 
     @property
     def place_rows(self) -> int:
-        """Lane vectors of a tile in ``place_material``."""
         return self.coefficients + (len(self.laws) > 1)
 
     def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:

@@ -209,7 +209,6 @@ class TermPhases(Storage):
 
     @ti.func
     def pose_rotation(self, e, m):
-        """Rotation matrix of a manipulator at the end of the environment step, 3x3 float64."""
         pose = self.pose[e, self.substeps, m]
         return rotation_matrix(vec4(pose[3], pose[4], pose[5], pose[6]))
 

@@ -130,7 +130,6 @@ class Code:
         return self._b.fneg(a)
 
     def root(self, a: ir.Value) -> ir.Value:
-        """Square roots."""
         kind = ir.FunctionType(a.type, [a.type])
         wide = f"v{LANE}" if isinstance(a.type, ir.VectorType) else ""
         name = f"llvm.sqrt.{wide}{'f32' if isinstance(self.real, ir.FloatType) else 'f64'}"
@@ -198,14 +197,12 @@ class Code:
         self._b.store(value, self.at(pointer, entry * LANE), align=self._align)
 
     def lane_vector(self, pointer: ir.Value, entry: int) -> ir.Value:
-        """A lane vector."""
         return self._b.load(self._wide(self.at(pointer, entry * LANE), LANE), align=self._align)
 
     def put_lane_vector(self, pointer: ir.Value, entry: int, value: ir.Value) -> None:
         self._b.store(value, self._wide(self.at(pointer, entry * LANE), LANE), align=self._align)
 
     def put(self, name: str, value: ir.Value) -> None:
-        """Write an output of the function."""
         self._b.store(value, self.places[name])
 
     def end(self) -> None:
@@ -223,7 +220,6 @@ class Code:
         return self._shuffled(one, one, [0] * width)
 
     def vector(self, values: Sequence[ir.Value]) -> ir.Value:
-        """A vector of numbers."""
         out: ir.Value = ir.Constant(ir.VectorType(self.real, len(values)), ir.Undefined)
         for k, value in enumerate(values):
             out = self._b.insert_element(out, value, ir.IntType(32)(k))
@@ -241,11 +237,9 @@ class Code:
         return self._shuffled(v0, v1, range(8)), v2
 
     def parts(self, row: Row) -> list[ir.Value]:
-        """The 4-vectors of a row."""
         return [self._shuffled(row[0], row[0], range(4 * k, 4 * k + 4)) for k in (0, 1)] + [row[1]]
 
     def both(self, operation: Callable[..., ir.Value], *rows: Row) -> Row:
-        """An operation on rows."""
         return operation(*(row[0] for row in rows)), operation(*(row[1] for row in rows))
 
     def times(self, row: Row, factor: ir.Value, to: Row | None = None) -> Row:
@@ -282,11 +276,9 @@ class Scalars(Code):
         return self._b.uitofp(condition, self.real)
 
     def where(self, condition: ir.Value) -> AbstractContextManager[Any]:
-        """Write a block that runs only if a condition is met."""
         return self._b.if_then(condition)
 
     def variables(self, values: Sequence[ir.Value]) -> list[ir.Value]:
-        """Variables that hold some numbers."""
         with self._b.goto_entry_block():
             places = [self._b.alloca(self.real) for _ in values]
         self.set_variables(places, values)

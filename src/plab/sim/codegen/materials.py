@@ -269,7 +269,6 @@ class Particle:
 
 
 def series_of(real: ir.Type) -> algebra.Series:
-    """Return the series of a precision."""
     return algebra.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
 
 
@@ -329,7 +328,6 @@ def tile_stress(tile: Tile) -> None:
 
 
 def tile_flow(tile: Tile) -> None:
-    """F of a tile after the substep."""
     tile.leave("f_new", von_mises.flow(tile.take("d"), tile.take("g"), tile.take("p")[2], tile.series))
 
 

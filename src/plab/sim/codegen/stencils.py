@@ -229,7 +229,6 @@ def _sum(factor: float, values: Sequence[Any], to: Sequence[Any]) -> list[Any]:
 
 
 def _at(field: Sequence[Sequence[Number]], *offset: int) -> list[Any]:
-    """An affine field at a node."""
     out = list(field[0])
     for steps, increment in zip(offset, field[1:], strict=True):
         out = _sum(float(steps), increment, out)
