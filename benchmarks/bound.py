@@ -20,7 +20,7 @@ from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, load_config
 from plab.sim.compiler import ti
-from plab.sim.cpu_engine import SPLIT
+from plab.sim.cpu_engine import MIN_TASK_SIZE
 from plab.sim.runtime import Runtime, start_runtime
 from plab.sim.storage import STATE
 
@@ -53,7 +53,7 @@ class Copy:
         self.cuda = runtime.device == "cuda"
         self.workers = GPU_THREADS if self.cuda else runtime.threads
         # Taichi hands out CPU loops in chunks: one iteration in each does a thread's work.
-        self.split = 1 if self.cuda else SPLIT
+        self.split = 1 if self.cuda else MIN_TASK_SIZE
         self.width = 1 if self.cuda else VECTOR_BYTES // 4
         size = int(FOOTPRINTS[-1] / 2 / (4 * self.width))
         # Fields, because LLVM vectorises copies of them and not those of arrays.

@@ -116,25 +116,21 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
                 "scene one of its own"
             )
         values[name] = np.broadcast_to(numbers if numbers.ndim > 1 else numbers.reshape(-1, 1), counts)
-    return tuple(
-        _with_own(scene, {name: table[e].tolist() for name, table in values.items()})
-        for e, scene in enumerate(scenes)
-    )
-
-
-def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
-    """Return a scene with these material values, by name and body."""
-    shared: dict[str, Any] = {name: column[0] for name, column in values.items() if name in MATERIAL_KEYS}
-    bodies = []
-    for body, material, *numbers in zip(scene.bodies, scene.materials, *values.values(), strict=True):
-        own = {key: value for key, value in zip(values, numbers, strict=True) if key in material.kind.keys}
-        fields: dict[str, Any] = {key: value for key, value in own.items() if key in MATERIAL_KEYS}
-        if scene.material_count == 1:
-            # A single material belongs to the scene, not to a body.
-            fields = dict.fromkeys(fields)
-        others = {key: value for key, value in own.items() if key not in MATERIAL_KEYS}
-        bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **others}))
-    return replace(scene, bodies=tuple(bodies), **(shared if scene.material_count == 1 else {}))
+    changed = []
+    for e, scene in enumerate(scenes):
+        # A single material belongs to the scene, not to a body.
+        single = scene.material_count == 1
+        bodies = []
+        for b, (body, material) in enumerate(zip(scene.bodies, scene.materials, strict=True)):
+            own = {key: float(table[e, b]) for key, table in values.items() if key in material.kind.keys}
+            fields: dict[str, Any] = {key: own.pop(key) for key in MATERIAL_KEYS if key in own}
+            fields = dict.fromkeys(fields) if single else fields
+            bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **own}))
+        shared: dict[str, Any] = {
+            key: float(values[key][e, 0]) for key in MATERIAL_KEYS if single and key in values
+        }
+        changed.append(replace(scene, bodies=tuple(bodies), **shared))
+    return tuple(changed)
 
 
 def parameter_gradient(material: Material, bars: Sequence[float], keys: Sequence[str]) -> list[float]:

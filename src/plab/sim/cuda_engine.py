@@ -109,13 +109,8 @@ class CudaEngine(CudaPhases):
     def step_adjoint(
         self, state, bar, poses, actions, actions_bar, terms, at, slot, t, stamp, contact
     ) -> None:
-        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and of its
-        loss, with its measures written to ``terms`` from entry ``at``.
-
-        ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
-        likewise. If there was no ``contact`` up to the end of this step, ``bar`` is not needed and does not
-        contain the adjoint.
-        """
+        """Adjoint of one environment step, as :meth:`plab.sim.cpu_engine.CpuEngine.step_adjoint_kernel`;
+        without ``contact``, ``bar`` does not contain the adjoint."""
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
         self.losses(state, end, terms, at, stamp)

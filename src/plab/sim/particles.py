@@ -8,7 +8,7 @@ before every environment step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from plab.sim.compiler import ti
 from plab.sim.state import State
 from plab.sim.storage import AT_C, AT_F, AT_V, STATE
 from plab.sim.tensors import copy_numbers
-
-if TYPE_CHECKING:
-    from plab.sim.cpu_engine import CpuEngine
 
 STAMP_MAX = 2**31 - 2**20
 
@@ -88,9 +85,9 @@ class Particles:
         places: Places in all environments, padding included.
     """
 
-    def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
+    def __init__(self, engine: Any, numpy_real: type) -> None:
         """Allocate; call :meth:`start_order` next. ``numpy_real`` is NumPy's type of numbers."""
-        self.engine: Any = engine
+        self.engine = engine
         self.places = engine.batch * engine.tiles * engine.lanes
         self.current = self.array(1)
         self.numbers = self.order_array(1)

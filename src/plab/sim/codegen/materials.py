@@ -109,7 +109,8 @@ def stress_adjoint(
     adjoint of A (9)."""
 
     def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
-        tau = von_mises.stress(x[:6], x[7], x[6], *x[8:], series)
+        mu, lam, limit = x[8:]
+        tau = von_mises.stress(x[:6], x[7], x[6], mu, lam, limit, series)
         return scattered_matrix(tau, [0.0] * 9, fixed[0], 0.0), []
 
     out = pulled_back(outputs, [*d, c2, j, *parameters], [scale], a_bar)
