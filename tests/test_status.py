@@ -150,6 +150,6 @@ def test_all_runs_of_a_sweep_are_shown_until_they_have_ended(folder: Path, monke
 
     watch(lambda: find(folder, "variant=1,3", "seed=1,2"), meanwhile)
     assert len(seen) == 2
-    assert re.search(r"Rope-v3 adam seed 1 +running +3/4 +[\d.]+ +[\d.]+/s +\d+ s", seen[0])
+    assert re.search(r"Rope-v3 adam seed 1 +running +3/4 +[\d.]+ +[\d.]+/s +0:00:\d\d", seen[0])
     assert "4 runs: 1 done, 1 running, 1 failed, 1 missing" in seen[0]
     assert "4 runs: 3 done, 1 failed\n" in screen.getvalue()

@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Any
 
 from rich.console import Console, Group
@@ -24,16 +25,8 @@ _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missin
 
 
 def duration(seconds: float) -> str:
-    """Format a time: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``; ``?`` for NaN."""
-    if not math.isfinite(seconds):
-        return "?"
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    if minutes < 100:
-        return f"{minutes} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d {hours % 24} h"
+    """Format a time: ``0:12:30`` or ``2 days, 4:00:00``; ``?`` for NaN."""
+    return str(timedelta(seconds=round(seconds))) if math.isfinite(seconds) else "?"
 
 
 def show(found: Survey) -> None:
