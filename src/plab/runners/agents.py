@@ -172,7 +172,7 @@ class ReplayBuffer:
         """Allocate a buffer for the latest transitions of each agent, given the number of training
         transitions."""
         self.added = 0
-        self._agents, self._sizes, self._window = agents, sizes, sizes.window(buffer_size)
+        self._sizes, self._window = sizes, sizes.window(buffer_size)
         self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
         n, horizon = sizes.envs, sizes.horizon
         shape = agents, capacity
