@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
@@ -75,14 +74,7 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
     at = next(k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
     given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
     notebook.cells.insert(at + 1, nbformat.v4.new_code_cell(f"# Given on the command line\n{given}"))
-    # Executed in the working directory, so that relative paths are valid.
-    client = NotebookClient(
-        notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": os.getcwd()}}
-    )
-    client.create_kernel_manager()
-    if client.km is not None and os.name == "posix":
-        # Sockets as files of the user, because others on the computer could read TCP connections.
-        client.km.transport = "ipc"
+    client = NotebookClient(notebook, timeout=None, kernel_name="python3")
     try:
         # Output of the kernel process concerns Jupyter; output of cells is in the notebook.
         client.execute(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
