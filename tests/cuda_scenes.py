@@ -71,6 +71,7 @@ def computed(simulator: Simulator, scenes: Sequence[int] = ALL) -> Results:
     out |= {f"{name}_bar": getattr(first, name) for name in ("x", "v", "C", "F", "poses")}
     out |= {"terms": rollout.step_terms, "gradient": rollout.gradient, "mass": simulator.mass_tensor()}
     out |= {"initial_terms": rollout.initial_terms, "material": simulator.material_gradient()}
+    out |= simulator.world_gradient()
     return {name: np.array(values) for name, values in out.items()}
 
 

@@ -209,7 +209,7 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         with pytest.raises(ValueError, match=named):
             call()
     assert sim.scenes == SCENES
-    for gradient in (sim.material_gradient, sim.state_gradient):
+    for gradient in (sim.material_gradient, sim.state_gradient, sim.world_gradient):
         with pytest.raises(RuntimeError, match="full_gradient=True"):
             gradient()
 

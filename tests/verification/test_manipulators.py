@@ -18,7 +18,7 @@ import torch
 
 import reference_mpm as reference
 from plab.losses import make_terms
-from plab.scenes import sample_particles
+from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator, State
 from suite import DEVICE, FAR, KINDS, NEAR, assert_same_state, batch, reference_state, scene
 
@@ -127,11 +127,13 @@ class Point(NamedTuple):
         state: Initial state.
         actions: Actions, shape [STEPS, A].
         material: Young's modulus, Poisson ratio and yield stress.
+        world: Friction of the floor, gravity (3), and friction of each manipulator; None: the scene's.
     """
 
     state: State
     actions: np.ndarray = ACTIONS
     material: tuple[float, float, float] = MATERIAL
+    world: np.ndarray | None = None
 
 
 Way = Callable[[float], Point]
@@ -166,10 +168,19 @@ def put(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
         The actions, shape [batch, STEPS, A].
     """
     full = [*points, *([points[-1]] * (BATCH - len(points)))]
+    if points[0].world is not None:
+        sim.set_scenes([world_scene(p.world) for p in full], particles=[X] * BATCH)
     sim.set_material(*np.array([p.material for p in full]).T)
     names = ("x", "v", "C", "F", "poses")
     sim.set_initial_state(State(*(np.stack([getattr(p.state, name) for p in full]) for name in names)))
     return np.stack([p.actions for p in full])
+
+
+def world_scene(world: np.ndarray) -> Scene:
+    """Return the scene with other friction and gravity."""
+    frictions = zip(SCENE.manipulators, world[4:].tolist(), strict=True)
+    tools = tuple(replace(tool, friction=friction) for tool, friction in frictions)
+    return replace(SCENE, floor_friction=world[0], gravity=tuple(world[1:4].tolist()), manipulators=tools)
 
 
 def losses(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
@@ -394,3 +405,30 @@ def test_no_particle_gets_deep_into_a_manipulator_that_presses(touched: Simulato
             np.testing.assert_allclose(state.v[len(TOUCHING) :].mean(axis=1), [fall] * 4, atol=1e-14)
     moved = np.abs(state.x - X).max(axis=(1, 2))[: len(TOUCHING)]
     assert (moved > 0.02).all(), f"not every manipulator pressed: {moved}"
+
+
+@pytest.mark.parametrize("contact", ["soft", "hard"])
+def test_gradients_by_friction_and_gravity(touched: Simulator, contact: str) -> None:
+    """A sliding block at each manipulator, and on the floor."""
+    touched.set_contact(contact)
+    world = np.array([0.3, 2.0, -30.0, 1.0, *np.linspace(0.2, 0.5, len(KINDS))])
+    sliding = np.array([3.0, -1.0, 2.0]) + np.zeros_like(X)
+    starts = [*(start(near, v=sliding) for near in TOUCHING.values())]
+    starts.append(start(x=X - [0.0, 0.17, 0.0], v=sliding))
+    points = [Point(state, world=world) for state in starts]
+    touched.rollout(put(touched, points))
+    gradient = touched.world_gradient()
+    by_world = np.column_stack([gradient[name] for name in ("floor_friction", "gravity", "friction")])
+    asked = [[4 + KINDS.index(kind) for kind in near] for near in TOUCHING.values()] + [[0]]
+    for entries in (asked, [[1, 2, 3]] * len(points)):
+        ways = {}
+        for e, (point, own) in enumerate(zip(points, entries, strict=True)):
+            for k in own:
+                step = (10.0 if k in (1, 2, 3) else 0.1) * np.eye(len(world))[k]
+                ways[f"environment {e}, {k}"] = (
+                    lambda h, point=point, step=step: point._replace(world=point.world + h * step),
+                    by_world[e] @ step,
+                )
+        assert all(slope for _, slope in ways.values())
+        check_slopes(touched, ways)
+    touched.set_scenes(SCENES)

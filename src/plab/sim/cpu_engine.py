@@ -239,6 +239,11 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     @ti.func
+    def accumulate_world(self, grid_index, e, entry, value):
+        """Add to an adjoint of frictions and gravity, where one thread owns it."""
+        self.world_bar[grid_index, entry] = self.world_bar[grid_index, entry] + ti.cast(value, ti.f64)
+
+    @ti.func
     def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
         """Adjoint of all manipulators' motion in substep s: pose_bar goes from its end to its start."""
         for _shape, start, stop in ti.static(self.shape_ranges):

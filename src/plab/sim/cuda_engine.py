@@ -289,6 +289,8 @@ class CudaEngine(CudaPhases):
         if ti.static(self.full_gradient):
             for row in range(self.batch * self.materials):
                 self.take_material(row)
+            for e in range(self.batch):
+                self.take_world(e)
         for q in range(self.pose_threads):
             self.block_count[0] = 0
             m = q // self.batch

@@ -6,6 +6,7 @@ per substep, so that the pose adjoints take one launch per environment step. Dis
 atomics, so that sums and ties do not depend on timing.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,7 +26,7 @@ from plab.sim.grid_phases import MASS_MIN
 from plab.sim.motion import PosePhases, vec7
 from plab.sim.particle_phases import affine_field, spline, spline_slope, widen
 from plab.sim.shapes import signed_distance
-from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
+from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT, WORLD
 
 DISTANCE_GROUPS = 256
 """Threads per environment and manipulator that reduce distances; a multiple of the warp size."""
@@ -85,6 +86,7 @@ class CudaPhases(OrderPhases, PosePhases):
         self.frame_sums = self.sums(self.batch * self.substeps * max(1, self.manipulators) * FRAME_ADJOINT)
         self.pose_sums = self.sums(self.batch * max(1, self.manipulators) * 8)
         self.material_sums = self.sums(self.material_bar.shape[0] * self.coefficients)
+        self.world_sums = self.sums(math.prod(self.world_bar.shape))
 
     def allocate_impulses(self) -> None:
         self.sums_impulses = True
@@ -323,6 +325,18 @@ class CudaPhases(OrderPhases, PosePhases):
         """Add to a frame's adjoint; ``grid_index`` is the substep of an environment."""
         at = (grid_index * self.manipulators + m) * FRAME_ADJOINT + entry
         self.add_up(self.frame_sums, at, ti.cast(value, ti.f64))
+
+    @ti.func
+    def accumulate_world(self, grid_index, e, entry, value):
+        """Add to an adjoint of an environment's frictions and gravity."""
+        self.add_up(self.world_sums, e * (WORLD + self.manipulators) + entry, ti.cast(value, ti.f64))
+
+    @ti.func
+    def take_world(self, e):
+        """Add the contributions of an environment step to the adjoints of frictions and gravity."""
+        for entry in range(WORLD + self.manipulators):
+            at = e * (WORLD + self.manipulators) + entry
+            self.world_bar[e, entry] += self.take_sum(self.world_sums, at)
 
     # -- poses --------------------------------------------------------------------------------------
 

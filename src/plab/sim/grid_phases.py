@@ -5,7 +5,15 @@ import math
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
-from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, BLOCK, Storage
+from plab.sim.storage import (
+    AT_FRAME_GAP,
+    AT_FRAME_ROTATION,
+    AT_FRAME_SPIN,
+    AT_FRAME_VELOCITY,
+    BLOCK,
+    WORLD,
+    Storage,
+)
 from plab.sim.tensors import Array
 
 MASS_MIN = 1e-12
@@ -43,6 +51,16 @@ def with_friction_adjoint(t, rn, friction, bar):
         t_bar = factor * bar - (friction * rn * along / (length * length)) * t
         rn_bar = friction * along
     return t_bar, rn_bar
+
+
+@ti.func
+def friction_adjoint(t, rn, friction, bar):
+    """Adjoint of the friction coefficient under :func:`with_friction`."""
+    length = t.norm()
+    out = 0.0 * rn
+    if length + rn * friction > 0.0 and length > 0.0:
+        out = rn * t.dot(bar) / length
+    return out
 
 
 class GridPhases(Storage):
@@ -175,6 +193,9 @@ class GridPhases(Storage):
                 t0_bar, rn_bar = with_friction_adjoint(t0, rn, friction, bar)
                 t0_bar *= strength
                 rn_bar *= strength
+                if ti.static(self.full_gradient):
+                    own = strength * friction_adjoint(t0, rn, friction, bar)
+                    self.accumulate_world(grid_index, e, WORLD + m, own)
                 rn_bar -= normal.dot(t0_bar)
                 r_bar = (1.0 - strength) * bar + t0_bar + rn_bar * normal
                 normal_bar = rn_bar * r - rn * t0_bar
@@ -261,7 +282,7 @@ class GridPhases(Storage):
         return self.wall_free(i, v1, v1, 2)
 
     @ti.func
-    def walls_adjoint(self, i, v, friction, bar):
+    def walls_adjoint(self, grid_index, e, i, v, friction, bar):
         v1 = self.wall_free(i, v, v, 0)
         v2 = v1
         floored = self.has_floor_friction(i, v1, friction)
@@ -269,6 +290,11 @@ class GridPhases(Storage):
             v2 = self.floor(v1, friction)
         out = self.wall_free(i, v2, bar, 2)
         if floored:
+            if ti.static(self.full_gradient):
+                if friction < STICKING:
+                    slid, slid_bar = ti.Vector([v1[0], v1[2]]), ti.Vector([out[0], out[2]])
+                    own = friction_adjoint(slid, v1[1], friction, slid_bar)
+                    self.accumulate_world(grid_index, e, 0, own)
             out = self.floor_adjoint(v1, friction, out)
         else:
             out = self.wall_free(i, v1, out, 1)
@@ -350,7 +376,7 @@ class GridPhases(Storage):
                 v = self.after_manipulators(e, s, x, free, near, self.manipulators)
             friction = self.material[e][0]
             v_out = self.walls(i, v, friction)
-            v_bar = self.walls_adjoint(i, v, friction, bar)
+            v_bar = self.walls_adjoint(grid_index, e, i, v, friction, bar)
             if near != 0:
                 for shape, start, stop in ti.static(tuple(reversed(self.shape_ranges))):
                     for back in range(stop - start):
@@ -362,6 +388,8 @@ class GridPhases(Storage):
                             v_bar = self.contact_adjoint(shape, grid_index, e, s, m, x, v_in, v_bar)
             mass_bar = 0.0 * total[3]
             for k in ti.static(range(3)):
+                if ti.static(self.full_gradient):
+                    self.accumulate_world(grid_index, e, 1 + k, self.dt * v_bar[k])
                 out[k] = v_bar[k] / total[3]
                 mass_bar -= v_bar[k] * total[k] / (total[3] * total[3])
             out[3] = mass_bar

@@ -34,6 +34,7 @@ from plab.sim.state import (
     broken_terms,
     require_none,
 )
+from plab.sim.storage import WORLD
 from plab.sim.tape import RecordedStates, Tape, closed_loop, record
 from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
 from plab.sim.term_phases import LossTerm
@@ -94,7 +95,8 @@ class Simulator:
             threads: CPU threads; default: all available. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             full_gradient: Whether a rollout's gradient includes those with respect to the initial state
-                (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
+                (:meth:`state_gradient`), the material (:meth:`material_gradient`), gravity and friction
+                (:meth:`world_gradient`).
             deterministic: Whether CUDA is bitwise reproducible, independent of the batch, see
                 :mod:`plab.sim.cuda_sums`; the CPU always is.
             impulses: Whether :meth:`step` sums the impulses on the manipulators (:meth:`impulses`).
@@ -644,6 +646,26 @@ class Simulator:
             ]
         )
         return gradient if materials > 1 else gradient[:, 0]
+
+    def world_gradient(self) -> dict[str, np.ndarray]:
+        """Return the gradient of the last :meth:`rollout`'s loss with respect to gravity and friction.
+
+        Returns:
+            Derivatives with respect to ``floor_friction``, shape [batch], ``gravity``, shape [batch, 3], and
+            the manipulators' ``friction``, shape [batch, manipulator]. At the onset of sticking one-sided
+            derivatives differ; while a node sticks they are 0.
+
+        Raises:
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
+                rollout with a gradient.
+        """
+        self._require_gradient()
+        bar = (
+            self._engine.world_bar.to_numpy()
+            .reshape(self.batch, -1, WORLD + self._engine.manipulators)
+            .sum(1)
+        )
+        return {"floor_friction": bar[:, 0], "gravity": bar[:, 1:WORLD], "friction": bar[:, WORLD:]}
 
     def loss_gradient(self) -> State:
         """Return the gradient of the weighted loss of the current state with respect to this state, without

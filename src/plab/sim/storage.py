@@ -43,6 +43,9 @@ BLOCK = 1 << BLOCK_BITS
 CHUNKS = 8
 """Private grids per environment on the CPU: a constant, because the order of summation follows from it."""
 
+WORLD = 4
+"""Number of adjoints before those of the manipulators' friction: the floor's friction and gravity (3)."""
+
 FRAME_ADJOINT = 25
 AT_FRAME_VELOCITY, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_GAP = 3, 6, 15, 24
 """Adjoint entries per manipulator and substep, and where they begin: centre (3), velocity (3), rotation (9),
@@ -240,7 +243,9 @@ class Storage:
         # Adjoints of the coefficients, material by material.
         rows = b * self.chunks * self.materials if self.full_gradient else 1
         self.material_bar = ti.field(ti.f64, shape=(rows, self.coefficients))
-        self.adjoint_sums += [(self.pose_bar, 8), (self.material_bar, 0)]
+        rows = b * self.chunks if self.full_gradient else 1
+        self.world_bar = ti.field(ti.f64, shape=(rows, WORLD + self.manipulators))
+        self.adjoint_sums += [(self.pose_bar, 8), (self.material_bar, 0), (self.world_bar, 0)]
 
     @ti.kernel
     def clear_adjoint(self, bar: Array):
