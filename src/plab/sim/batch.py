@@ -47,8 +47,9 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
         scene.validate()
         for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
             if own != other:
+                values = "" if name == "manipulators" else f": {own}, not {other}"
                 raise SceneError(
-                    f"scenes of one batch need the same {name}; scene {number} differs from {of}"
+                    f"scenes of one batch need the same {name}; scene {number} differs from {of}{values}"
                 )
 
 
