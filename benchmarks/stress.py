@@ -25,11 +25,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 
 from common_scene import common_actions, common_scene
 from plab.bench.stability import ACTIONS, COLUMNS, stress, stress_simulator, summarise
 from plab.cli.command import Parser, command_line, positive, to_write
-from plab.cli.tables import measure_table, write_csv
+from plab.cli.tables import measure_table
 from plab.config import ConfigError, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.scenes import PRECISIONS, Body, Manipulator, Scene, SceneError, Vec3, vector3
@@ -399,7 +400,8 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
         (row["precision"], row["family"], row["case"], cast(np.ndarray, row["norms"])[::-1]) for row in rows
     ]
     table = [(*which, back, norm) for *which, norms in parts for back, norm in enumerate(norms)]
-    write_csv(path, [("precision", "family", "case", "back", "norm"), *table], digits=6)
+    columns = ["precision", "family", "case", "back", "norm"]
+    pd.DataFrame(table, columns=columns).to_csv(path, index=False, float_format="%.6g")
     with style():
         figure, panel = single(7.0, 4.0)
         colours: dict[str, str] = {}

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from plab.cli.command import Parser, command_line, task_list, to_write
-from plab.cli.tables import print_table, write_csv
+from plab.cli.tables import print_table
 from plab.config import Config, build_scene, load_config
 from plab.config.compose import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -121,8 +121,8 @@ def targets(argv: Sequence[str]) -> None:
     print_table(list(table.columns), table.itertuples(index=False, name=None), digits=4)
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if options.csv is not None:
-        kept = table.drop(columns="seconds")
-        write_csv(options.csv, [kept.columns, *kept.itertuples(index=False, name=None)], digits=6)
+        options.csv.parent.mkdir(parents=True, exist_ok=True)
+        table.drop(columns="seconds").to_csv(options.csv, index=False, float_format="%.6g")
 
 
 def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:

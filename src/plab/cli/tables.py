@@ -43,7 +43,7 @@ def measure_table(
         print("  ".join(shown), flush=True)
 
     if path is not None:
-        write_csv(path, [columns])
+        _write(path, columns, "w")
     table: list[Mapping[str, object]] = []
     for row in rows:
         if not table:
@@ -52,25 +52,15 @@ def measure_table(
         values = [row[name] for name in columns]
         show(values)
         if path is not None:
-            write_csv(path, [values], "a")
+            _write(path, values, "a")
         table.append(row)
     return table
 
 
-def write_csv(path: Path, rows: Iterable[Iterable[Any]], mode: str = "w", digits: int | None = None) -> None:
-    """Write rows to a CSV file, creating its folder if necessary.
-
-    Args:
-        path: The file.
-        rows: Its rows; the names of the columns are the first.
-        mode: ``w``, or ``a`` to add rows to those that are there.
-        digits: Digits of fractional numbers; default: all.
-    """
+def _write(path: Path, row: Iterable[object], mode: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    if digits is not None:
-        rows = ([_text(value, digits) for value in row] for row in rows)
     with path.open(mode, newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+        csv.writer(file, lineterminator="\n").writerow(row)
 
 
 def print_table(
