@@ -24,7 +24,7 @@ EQUAL = 1.0 + 1e-6
 
 
 class Chamfer(ParticleTerm):
-    """Chamfer distance of squared lengths, and its gradient."""
+    """Squared Chamfer distance between particles and target, with its gradient."""
 
     name = "chamfer"
     label = "mean squared distances of particles and points of the target to the nearest of the other"

@@ -105,7 +105,7 @@ class TermPhases(Storage):
 
     @ti.func
     def folded_node(self, base, i: ti.template(), j: ti.template(), k: ti.template()):
-        """Array index along each axis of a stencil's node in the mass tensor's sense."""
+        """Array index (3) of a stencil's node; ghost nodes below the domain count as the lowest nodes."""
         return ti.max(base + ti.Vector([i, j, k]), 1)
 
     @ti.func
