@@ -333,7 +333,7 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return the indices of the observed pose entries, 8 per manipulator; the gap is observed only for grippers."""
+    """Return the indices of the observed pose entries, 8 per manipulator; the gap counts for grippers."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.kind.grips for m in scene.manipulators]
     return np.flatnonzero(observed)

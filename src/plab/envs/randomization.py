@@ -171,7 +171,7 @@ class EpisodeRandomizer:
         return build_scene(cfg)
 
     def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
-        """Return the target of a scene; the base scene's, if the recipe simulates it or it comes from a file."""
+        """Return the target of a scene; that of the base scene if it is simulated or read from a file."""
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
