@@ -23,6 +23,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -35,7 +36,8 @@ from plab.envs.tensors import TensorEnv
 from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, RlConfig
 from plab.runners.policy import torch_settings
 from plab.runners.ppo import PpoConfig
-from plab.runners.rl import Population
+from plab.runners.rl import RlRunner
+from plab.runners.runner import SimulatorCache
 from plab.runners.training import evaluate
 from plab.sim.compiler import ti
 
@@ -82,7 +84,8 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
     with torch_settings(method.torch_threads, tf32=method.torch_device == "cuda"):
         own = [one for one in cfgs for _ in range(method.num_envs)]
         training, judge = EpisodeBatch(own, contact=method.contact), TensorEnv(EpisodeBatch(cfgs))
-        population = Population(cfgs, training)
+        population = RlRunner([SimpleNamespace(cfg=one) for one in cfgs], "", SimulatorCache())
+        population.prepare(training)
         evaluation = partial(evaluate, judge, population.decide)
         evaluation()
         population.train(2 * method.num_envs)

@@ -12,8 +12,7 @@ import pytest
 
 from browsing import browser  # noqa: F401
 from plab.config import Config
-from plab.runners.runner import SimulatorCache
-from plab.runners.tracks import Outcome
+from plab.runners.runner import Outcome, SimulatorCache
 from plab.sim.runtime import cuda_devices
 from refusals import ending, refusal, snapshot
 from suite import DEVICE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,10 @@ from plab.envs.core import EpisodeBatch
 from plab.problem import BatchMeasures
 from plab.results import RunResult, read
 from plab.runners import run_config
-from plab.runners.actors import DEVIATION_MIN, training_scenes
-from plab.runners.pods import PodsTraining
+from plab.runners.pods import PodsRunner
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import td_lambda
-from plab.runners.training import shared_batches
+from plab.runners.training import DEVIATION_MIN, shared_batches, training_scenes
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
@@ -57,6 +57,12 @@ def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
     """Environments of a training and of the evaluation, all of them of the same scene."""
     training, judge = shared_batches(CACHE, ([cfg] * ENVS, cfg.method.contact), ([cfg], "hard"))
     return training, judge
+
+
+def prepared(cfg: Config) -> PodsRunner:
+    runner = PodsRunner([SimpleNamespace(cfg=cfg)], "", CACHE)
+    runner.prepare(environments(cfg)[0])
+    return runner
 
 
 def run(cfg: Config) -> RunResult:
@@ -184,7 +190,7 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path) -> None:
 def test_rounds_take_the_drawn_scenes_in_turn() -> None:
     cfg = make_config("results", "pods", "method.epochs=1")
     batch, _ = environments(cfg)
-    training, taken = PodsTraining([cfg], batch), []
+    training, taken = prepared(cfg), []
     for _ in range(3):
         training.cycle()
         taken.append([one.seed_scene for one in batch.configs])
@@ -200,13 +206,13 @@ def test_rounds_take_the_drawn_scenes_in_turn() -> None:
 
 
 @pytest.fixture
-def training() -> PodsTraining:
+def training() -> PodsRunner:
     """One of pods, in three environments."""
     cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01", "method.scenes=0")
-    return PodsTraining([cfg], environments(cfg)[0])
+    return prepared(cfg)
 
 
-def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monkeypatch) -> None:
+def test_a_round_improves_actions_and_imitates_them(training: PodsRunner, monkeypatch) -> None:
     plans, tried, problem = [], [], training.batch.problem
     improve, simulate = training._improved, problem.try_out
 
@@ -233,7 +239,7 @@ def test_what_is_observed_is_moved_together() -> None:
     words = "method.shift=0.1", "method.observation_noise=0", "method.scenes=0"
     cfg = make_config("results", "pods", *words)
     batch, _ = environments(cfg)
-    training, given = PodsTraining([cfg], batch), []
+    training, given = prepared(cfg), []
     training.statistics.var = np.linspace(0.25, 4.0, batch.observation_space.shape[0])
     training.freeze_moments()
     training.network.register_forward_pre_hook(lambda _, seen: given.extend(seen))
@@ -255,7 +261,7 @@ def test_what_is_observed_is_moved_together() -> None:
 
 @pytest.mark.parametrize("broken", [[1], [0, 1, 2]])
 def test_environments_that_break_off_teach_nothing(
-    training: PodsTraining, broken: list[int], monkeypatch
+    training: PodsRunner, broken: list[int], monkeypatch
 ) -> None:
     before = [parameter.clone() for parameter in training.network.parameters()]
     batch, learned = training.batch, []

@@ -18,7 +18,7 @@ from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
-from plab.runners import RunError, planner, run_batch, run_config, tracks
+from plab.runners import RunError, Step, Track, planner, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
 from plab.runners.planner import (
     Answer,
@@ -325,10 +325,10 @@ def test_a_resumed_run_equals_an_undisturbed_one(finished, tmp_path: Path, monke
 def test_a_resumed_run_keeps_its_best_actions(tmp_path: Path) -> None:
     cfg = make_config(tmp_path, "cem", "checkpoint_seconds=0")
     for scores in ((0.5, 0.25), (0.375,)):
-        track = tracks.Track(cfg, RunFile(cfg))
+        track = Track(cfg, RunFile(cfg))
         for score in scores:
             measures = {"loss": 1.0 - score, "score": score}
-            track.record(tracks.Step(measures, np.full((4, 6), score), {}, seconds=0.0), list(measures))
+            track.record(Step(measures, np.full((4, 6), score), {}), list(measures), 0.0)
         track.run.release()
     assert track.run.result.best_iteration == 0 and (track.best_actions == 0.5).all()
 
@@ -380,7 +380,7 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
 
     # One run reaches it after fewer rows than the other, which may not.
     enough = next(one for one in sorted(scores[0] + scores[1]) if len(set(map(len, until(one)))) == 2)
-    for module in (tracks, checking):
+    for module in (runner, checking):
         monkeypatch.setattr(module, "SOLVED", enough)
     cfgs = [make_config(tmp_path, "cem"), make_config(tmp_path, "cem", *OTHER)]
     run_batch(cfgs, cache=CACHE)

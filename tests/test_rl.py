@@ -25,10 +25,9 @@ from plab.objective import scores
 from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, run_batch, run_config, sb3, training
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path
-from plab.runners.rl import Population, agents_of
-from plab.runners.runner import episode_columns
+from plab.runners.rl import RlRunner, agents_of
+from plab.runners.runner import Outcome, episode_columns
 from plab.runners.sb3 import Sb3Runner
-from plab.runners.tracks import Outcome
 from plab.runners.training import evaluate, shared_batches
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
@@ -72,7 +71,7 @@ OWN = [name for name in METHODS if name != "tqc"]
 RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3"))
 """A population: different in seed, material and scene."""
 
-STEPS = {"tqc": (sb3.Sb3Training, "_note")}
+STEPS = {"tqc": (sb3.Sb3Runner, "_watch")}
 """Step of training outside populations."""
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])
@@ -248,7 +247,7 @@ def test_ppo_begins_as_the_profile_says() -> None:
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, lone, method, step, rows) -> None:
     cfg = make_config(tmp_path, method)
-    with stopped_at(step, *STEPS.get(method, (Population, "_step"))):
+    with stopped_at(step, *STEPS.get(method, (RlRunner, "_step"))):
         run_config(cfg, CACHE)
     assert len(partial(cfg).iterations) == rows
     run(cfg)
@@ -260,7 +259,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, lone, method, step,
 @pytest.mark.parametrize("method", OWN)
 def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method) -> None:
     cfgs = configs(tmp_path, method)
-    with stopped_at(18, Population, "_step"):
+    with stopped_at(18, RlRunner, "_step"):
         carry(cfgs)
     assert [len(partial(cfg).iterations) for cfg in cfgs] == [2] * 3
     carry(cfgs)
@@ -281,7 +280,7 @@ def test_runs_that_stand_at_different_evaluations_go_on_to_the_same_numbers(tmp_
 def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -> None:
     """Lost steps are computed again, to the same numbers; a replay buffer may be ahead of the state."""
     cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, "td3")]
-    with monkeypatch.context() as patch, stopped_at(27, Population, "_step"):
+    with monkeypatch.context() as patch, stopped_at(27, RlRunner, "_step"):
         # As if the process were killed.
         patch.setattr(RunFile, "close", lambda self, status, message: None)
         carry(cfgs)
@@ -310,7 +309,7 @@ def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
 
 def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
     cfgs = configs(tmp_path, "sac")
-    with stopped_at(18, Population, "_step"):
+    with stopped_at(18, RlRunner, "_step"):
         carry(cfgs)
     lost = cfgs[1].path.with_suffix(".replay")
     lost.unlink()
@@ -357,15 +356,15 @@ def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, lone, m
 
 def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None:
     """Have both environments of a population's second run break off in some steps of the training."""
-    intact, calls = Population._step, itertools.count()
+    intact, calls = RlRunner._step, itertools.count()
 
-    def step(self: Population) -> None:
+    def step(self: RlRunner) -> None:
         if next(calls) in steps:
             for env in (2, 3):
                 make_not_finite(self.batch.problem.simulator, env)
         intact(self)
 
-    monkeypatch.setattr(Population, "_step", step)
+    monkeypatch.setattr(RlRunner, "_step", step)
 
 
 @pytest.mark.parametrize("method", ["sac", "ppo"])
@@ -390,9 +389,9 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
 def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
     """All episodes of the second run break off, and the networks of the third run are not finite."""
     cfgs = configs(tmp_path, "sac")
-    intact = Population.train
+    intact = RlRunner.train
 
-    def train(self: Population, episodes: int) -> None:
+    def train(self: RlRunner, episodes: int) -> None:
         intact(self, episodes)
         if self.episodes == 12:
             with torch.no_grad():
@@ -401,7 +400,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
 
     with monkeypatch.context() as patch:
         break_steps(patch, range(12))
-        patch.setattr(Population, "train", train)
+        patch.setattr(RlRunner, "train", train)
         ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "failed"]
     assert ended[1].message.startswith("iteration 1: all 6 ")
@@ -426,7 +425,7 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
 @pytest.mark.parametrize("method", OWN)
 def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch, method) -> None:
     cfgs = configs(tmp_path, method, "sim.device=cuda", "method.torch_device=cuda")
-    with stopped_at(18, Population, "_step"):
+    with stopped_at(18, RlRunner, "_step"):
         run_batch(cfgs)
     with monkeypatch.context() as patch:
         break_steps(patch, {9})

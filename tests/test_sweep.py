@@ -16,7 +16,7 @@ from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
 from plab.results import RunFile, read
 from plab.results.running import acquire
-from plab.runners.tracks import Outcome, TogetherError
+from plab.runners.runner import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
 from plab.sweep.running import compose_jobs, look_up, plan
 from same_runs import raising

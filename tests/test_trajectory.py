@@ -19,8 +19,7 @@ from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import FAMILIES, RunError, run_config, trajectory
-from plab.runners.runner import SimulatorCache, measures, shared_problem
-from plab.runners.tracks import RunLog
+from plab.runners.runner import RunLog, SimulatorCache, measures, shared_problem
 from plab.runners.training import shared_batches
 from plab.runners.trajectory import UpdateRule
 from plab.sim import SimulationError, Simulator

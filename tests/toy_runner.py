@@ -18,7 +18,7 @@ from plab.config import Config, load_config
 from plab.config.families import FAMILIES
 from plab.results import read
 from plab.runners import Runner
-from plab.runners.tracks import RunError, Track
+from plab.runners.runner import RunError, Track
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 COARSE_32 = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")

@@ -3,14 +3,16 @@
 The layout is described in docs/developers/format.md. A run in progress stores its state in
 ``<name>.partial.h5``, which is replaced atomically at intervals: after a kill, the previous version remains,
 from which the same command resumes. Finished runs can be packed into archives, which load like folders. This
-package does not import torch or Taichi, and pandas and DuckDB on demand, so that runs start fast.
+package does not import torch or Taichi, and what reads many results on demand, so that runs start fast.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from plab.config.run import config_dict, config_hash
 from plab.config.selection import lookup
-from plab.results.archive import pack, unpack
-from plab.results.checking import Fault, check
-from plab.results.query import connect
 from plab.results.running import RunFile, read, write
 from plab.results.schema import (
     BUDGETS,
@@ -22,7 +24,12 @@ from plab.results.schema import (
     RunResult,
     row_count,
 )
-from plab.results.table import Row, load, read_curves, rows
+
+if TYPE_CHECKING:
+    from plab.results.archive import pack, unpack
+    from plab.results.checking import Fault, check
+    from plab.results.query import connect
+    from plab.results.table import Row, load, read_curves, rows
 
 __all__ = [
     "BUDGETS",
@@ -49,3 +56,18 @@ __all__ = [
     "unpack",
     "write",
 ]
+
+_MODULES = {
+    "archive": ("pack", "unpack"),
+    "checking": ("Fault", "check"),
+    "query": ("connect",),
+    "table": ("Row", "load", "read_curves", "rows"),
+}
+"""Names of each module that is imported on first use."""
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"plab.results.{module}"), name)
+    raise AttributeError(f"module 'plab.results' has no attribute '{name}'")

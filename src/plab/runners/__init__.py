@@ -15,8 +15,17 @@ from plab.config import Config
 from plab.config.families import FAMILIES, Appearance, Family, Rule, family
 from plab.errors import ConfigError, PlabError, traceback_wanted
 from plab.results import ResultsError, RunBusyError, RunFile
-from plab.runners.runner import Runner, SimulatorCache, Step, Track, measures, shared_problem
-from plab.runners.tracks import Outcome, RunError, TogetherError
+from plab.runners.runner import (
+    Outcome,
+    RunError,
+    Runner,
+    SimulatorCache,
+    Step,
+    TogetherError,
+    Track,
+    measures,
+    shared_problem,
+)
 
 __all__ = [
     "FAMILIES",

@@ -9,7 +9,6 @@ Datasets are written by ``plab dataset`` or Minari. To reproduce a result:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +17,8 @@ import numpy as np
 from plab.config import Config, ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorTraining
 from plab.runners.policy import PolicyConfig, Spaces, set_rate
-from plab.runners.training import PolicyRunner, whole_cycles
+from plab.runners.training import ActorRunner
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
@@ -46,21 +44,19 @@ class BcConfig(PolicyConfig):
     shift: float = field(metadata=ranges.FINITE)
 
 
-class Imitation(ActorTraining):
-    """A policy trained by supervised learning of actions (mean squared error), with augmented
-    observations."""
+class ImitationRunner(ActorRunner):
+    """Base of runners of a policy that learns actions (mean squared error) from augmented observations."""
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Begin; the seed is that of the initial weights and of the minibatches."""
+    def prepare(self, batch: EpisodeBatch) -> None:
         from plab.envs.observations import level_entries
 
-        super().__init__(cfgs, batch)
-        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfgs[0]), device=self._device)
+        super().prepare(batch)
+        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], self._cfg), device=self._device)
 
     def imitate(self, seen: torch.Tensor, wanted: torch.Tensor, count: int) -> float:
         """Train the policy on actions, shape [row, A], for scaled observations, shape [row, entry], with
         ``count`` minibatches; return the mean error."""
-        method, drawn = self._method, dict[str, Any](generator=self._generator, device=self._device)
+        method, drawn = self.method, dict[str, Any](generator=self._generator, device=self._device)
         minibatches: list[torch.Tensor] = []
         errors: list[torch.Tensor] = []
         for _ in range(count):
@@ -78,31 +74,30 @@ class Imitation(ActorTraining):
         return float(torch.stack(errors).mean())
 
 
-class Cloning(Imitation):
-    """A policy trained on a dataset; a cycle is one pass."""
+class BcRunner(ImitationRunner):
+    """Runner of a policy trained on a dataset; a cycle is one pass."""
 
     columns = ("imitation_error",)
     simulates = False
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
+    def prepare(self, batch: EpisodeBatch) -> None:
         """Begin with the observations and actions of the dataset."""
-        super().__init__(cfgs, batch)
-        data = pairs(self._method, self._spaces)
-        self.provenance["dataset_rows"] = self._cycle_steps = len(data[0])
-        self.total_steps = whole_cycles(self._method.episodes * batch.horizon, self._cycle_steps)
+        super().prepare(batch)
+        data = pairs(self.method, self._spaces)
+        self.tracks[0].run.result.provenance["dataset_rows"] = len(data[0])
+        self.set_cycle(batch, len(data[0]))
         self.statistics.update(data[0].astype(np.float64))
         self.freeze_moments()
         seen, self._wanted = (torch.as_tensor(part, device=self._device) for part in data)
         self._seen = self.scaled(seen)
 
-    @classmethod
-    def environments(cls, cfg: Config) -> list[Config]:
+    def environments(self, cfg: Config) -> list[Config]:
         return []
 
     def learn(self, rate_left: float) -> None:
         """Make one pass over the data, at a fraction of the learning rate."""
-        set_rate(self._optimizer, self._method.lr * rate_left)
-        count = math.ceil(len(self._seen) / self._method.batch_size)
+        set_rate(self._optimizer, self.method.lr * rate_left)
+        count = math.ceil(len(self._seen) / self.method.batch_size)
         self.note(imitation_error=np.array([self.imitate(self._seen, self._wanted, count)]))
 
 
@@ -133,11 +128,11 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
 FAMILY = Family(
     label="a policy that imitates the actions of a dataset",
     config=BcConfig,
-    runner=PolicyRunner,
-    columns=Cloning.columns,
-    may_be_nan=Cloning.columns,
+    runner=BcRunner,
+    columns=BcRunner.columns,
+    may_be_nan=BcRunner.columns,
     ranking="score",
-    rules={"bc": Rule(Cloning, BcConfig)},
+    rules={"bc": Rule(BcRunner, BcConfig)},
     contact="hard",
     methods={"bc": Appearance("BC", "#661100", "-.")},
 )

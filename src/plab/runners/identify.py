@@ -11,7 +11,6 @@ reproduce a result:
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -110,7 +109,7 @@ class IdentifyRunner(Runner):
 
     def step(self, track: Track) -> Step:
         """Simulate the trial and its perturbations, accept it if it fits better, and compute the next one."""
-        begin, method, state = time.perf_counter(), self.method, self._state
+        method, state = self.method, self._state
         changes = np.eye(len(method.parameters)) * method.difference
         trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
         positions, measured = self._simulate(np.exp(trials))
@@ -135,8 +134,8 @@ class IdentifyRunner(Runner):
         found["misfit"] = float(np.sqrt(3.0 * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
             found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
-        seconds, steps = time.perf_counter() - begin, len(self._actions) * len(trials)
-        return Step(measured | found, self._actions, dict(state), steps_forward=steps, seconds=seconds)
+        steps = len(self._actions) * len(trials)
+        return Step(measured | found, self._actions, dict(state), steps_forward=steps)
 
     def close(self) -> None:
         """Restore the configuration's scene."""
@@ -147,10 +146,10 @@ class IdentifyRunner(Runner):
         """Run the actions in the configuration's scene."""
         return super().judge(np.concatenate([actions] * self.problem.simulator.batch))
 
-    def tell(self, rows: Any, tracks: Any) -> None:
-        """Report the fit."""
-        texts = [f"{n} {rows[0][n]:.4g} ± {rows[0][f'{n}_deviation']:.2g}" for n in self.method.parameters]
-        self.report(self.tracks[0].iteration, f"misfit {rows[0]['misfit']:.3g}, {', '.join(texts)}")
+    def summary_line(self, means: Mapping[str, float], tracks: Any) -> str:
+        """Return the fit."""
+        fit = (f"{n} {means[n]:.4g} ± {means[f'{n}_deviation']:.2g}" for n in self.method.parameters)
+        return f"misfit {means['misfit']:.3g}, {', '.join(fit)}"
 
     def _simulate(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
         """Return positions after each step, shape [environment, T, particle, 3], with parameters of shape

@@ -10,7 +10,6 @@ Any planner or gradient method can plan from the current state; its keys are in 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -130,7 +129,7 @@ class MpcRunner(PlannerRunner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
-        begin, method, (track,) = time.perf_counter(), self.method, self.tracks
+        method, (track,) = self.method, self.tracks
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)
         start = CandidateStart(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
@@ -165,7 +164,6 @@ class MpcRunner(PlannerRunner):
             state,
             steps_forward=int(spent[0]) + len(share),
             steps_gradient=int(spent[1]),
-            seconds=time.perf_counter() - begin,
             whole=len(self._executed) == scene.horizon,
         )
         yield track, step

@@ -8,7 +8,6 @@ model.
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -296,10 +295,8 @@ class PlannerRunner(Runner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Make one iteration of the planners of all runs."""
-        begin = time.perf_counter()
         walks = {t: self._planners[t.number].plan(self.random(t.cfg.seed, t.iteration)) for t in tracks}
         shown, spent = self.drive(walks)
-        share = (time.perf_counter() - begin) / len(tracks)
         for track, (actions, measured) in shown.items():
             step = Step(
                 measured,
@@ -307,7 +304,6 @@ class PlannerRunner(Runner):
                 self._planners[track.number].state(),
                 steps_forward=spent[track][False],
                 steps_gradient=spent[track][True],
-                seconds=share,
             )
             yield track, step
 

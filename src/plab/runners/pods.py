@@ -16,17 +16,16 @@ alternate between them, and the policy imitates the latest actions of each scene
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorConfig, training_scenes
-from plab.runners.bc import Imitation
+from plab.runners.bc import ImitationRunner
 from plab.runners.policy import set_rate
-from plab.runners.training import PolicyRunner
+from plab.runners.training import ActorConfig, training_scenes
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
@@ -54,29 +53,25 @@ class PodsConfig(ActorConfig):
     shift: float = field(metadata=ranges.FINITE)
 
 
-class PodsTraining(Imitation):
-    """A policy and its rounds of training episodes."""
+class PodsRunner(ImitationRunner):
+    """Runner of a policy and its rounds of training episodes."""
 
     columns = ("train_reward", "train_score", "plan_reward", "plan_score")
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Begin; the seed is that of the initial weights and of the minibatches."""
-        updates = cfgs[0].method_as(PodsConfig).updates
+    def prepare(self, batch: EpisodeBatch) -> None:
         # Episodes of the policy, with gradient, and with the improved actions.
-        self.round_episodes = updates + 2, updates
-        super().__init__(cfgs, batch)
-        self._turns = max(1, math.ceil(self._method.scenes / batch.size))
+        self.round_episodes = self.method.updates + 2, self.method.updates
+        super().prepare(batch)
+        self._turns = max(1, math.ceil(self.method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
 
-    @classmethod
-    def environments(cls, cfg: Config) -> list[Config]:
+    def environments(self, cfg: Config) -> list[Config]:
         """Return the configurations of one scene per environment, up to ``num_envs``."""
-        scenes = cfg.method_as(PodsConfig).scenes
-        return super().environments(cfg)[: max(1, scenes)]
+        return super().environments(cfg)[: max(1, self.method.scenes)]
 
     def learn(self, rate_left: float) -> None:
         """Run a round: act, improve the actions, and imitate them."""
-        method, batch, self._failed = self._method, self.batch, set[int]()
+        method, batch, self._failed = self.method, self.batch, set[int]()
         if self._turns > 1:
             turn = self.episodes // (self.round_episodes[0] * batch.size)
             batch.renew(training_scenes(self._cfg, method, batch.size, turn))
@@ -120,7 +115,7 @@ class PodsTraining(Imitation):
         """Return actions, shape [env, T, A], improved by Adam along the gradient of the trajectory loss."""
         plan = torch.nn.Parameter(actions.clone())
         optimizer = torch.optim.Adam([plan], lr=rate)
-        for _ in range(self._method.updates):
+        for _ in range(self.method.updates):
             given = plan.detach()
             tried = self.batch.problem.try_out(
                 given if given.is_cuda else given.double().numpy(), gradient=True
@@ -149,10 +144,10 @@ class PodsTraining(Imitation):
 FAMILY = Family(
     label="a policy that imitates its own episodes, improved by the simulator's gradient",
     config=PodsConfig,
-    runner=PolicyRunner,
-    columns=PodsTraining.columns,
-    may_be_nan=PodsTraining.columns,
-    rules={"pods": Rule(PodsTraining, PodsConfig)},
+    runner=PodsRunner,
+    columns=PodsRunner.columns,
+    may_be_nan=PodsRunner.columns,
+    rules={"pods": Rule(PodsRunner, PodsConfig)},
     contact="hard",
     kind=GRADIENT,
     methods={"pods": Appearance("PODS", "#999933", "--")},

@@ -9,21 +9,20 @@ deterministic policy, which gives a row of the results. To reproduce a result:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.config import Config
 from plab.config.families import RL, Appearance, Family, Rule, family
 from plab.plugins import torch
 from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, ReplayBuffer, RlConfig, Sizes
 from plab.runners.policy import Moments, Spaces
 from plab.runners.ppo import PpoAgents, PpoConfig
+from plab.runners.runner import RunError
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
-from plab.runners.tracks import RunError
-from plab.runners.training import PolicyRunner, Training, TrainingSummary
+from plab.runners.training import PolicyRunner, TrainingSummary
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -37,8 +36,8 @@ def agents_of(method: RlConfig) -> type[Agents]:
     return family(method.family).rules[method.algorithm].what
 
 
-class Population(Training):
-    """Agents in lockstep, and their environments.
+class RlRunner(PolicyRunner):
+    """Runner of a population: agents in lockstep, and their environments.
 
     On CUDA the agents' parameters are stacked. On the CPU each agent is a separate stack: libraries select
     kernels by shape, so a joint stack would not be bitwise identical to a single agent.
@@ -49,17 +48,13 @@ class Population(Training):
 
     tf32 = True
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Build untrained agents for configurations with the same section ``method``.
-
-        Raises:
-            plab.runners.RunError: If their replay buffers do not fit into memory.
-        """
+    def prepare(self, batch: EpisodeBatch) -> None:
+        """Build untrained agents; RunError if their replay buffers do not fit into memory."""
         from plab.envs.tensors import TensorEnv
 
-        method = cfgs[0].method_as(RlConfig)
+        cfgs, method = [track.cfg for track in self.tracks], self.method
         kind = agents_of(method)
-        super().__init__(cfgs, batch, kind.cycle_steps(method, batch.horizon))
+        self.set_cycle(batch, kind.cycle_steps(method, batch.horizon))
         self._env, self._envs = TensorEnv(batch), method.num_envs
         self._device, cuda = torch.device(method.torch_device), method.torch_device == "cuda"
         spaces = Spaces.of(batch)
@@ -91,11 +86,11 @@ class Population(Training):
 
     def cycle(self) -> None:
         if self._observations is None:
-            self._observations = self._start()
+            self._observations = self._first_observations()
         for _ in range(self._cycle_steps // self._envs):
             self._step()
             if self.steps % (self._envs * self._horizon) == 0:
-                self.report()
+                self.report(self.episodes, self._shown)
 
     def decide(self, observations: Tensor) -> Tensor:
         parts = zip(self.stacks, self._split(self._own(observations, 1)), strict=True)
@@ -133,7 +128,7 @@ class Population(Training):
         stack, number = self._places[run]
         return stack.policy(number)
 
-    def _start(self) -> Tensor:
+    def _first_observations(self) -> Tensor:
         """Begin the first episodes, or replay those of the checkpoint to its step; return the
         observations."""
         for stack in self.stacks:
@@ -181,12 +176,6 @@ class Population(Training):
 
     def _split(self, table: Tensor) -> list[Tensor]:
         return list(table.split([stack.count for stack in self.stacks]))
-
-
-class RlRunner(PolicyRunner):
-    """Runner of a population of agents."""
-
-    training = Population
 
 
 FAMILY = Family(

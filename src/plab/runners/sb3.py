@@ -12,7 +12,7 @@ import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,13 +24,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecMonitor
 
-from plab.config import Config
 from plab.config.families import family
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.agents import LARGEST, OffPolicyConfig, ReplayBuffer, Sizes
 from plab.runners.policy import Moments, Policy, Spaces
-from plab.runners.training import PolicyRunner, Training, TrainingSummary
+from plab.runners.training import PolicyRunner, TrainingSummary
 
 
 @dataclass(frozen=True)
@@ -75,20 +74,19 @@ def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
     }
 
 
-class Sb3Training(Training):
-    """A model in training, between episodes or, without a replay buffer, updates.
+class Sb3Runner(PolicyRunner):
+    """Runner of a model, between episodes or, without a replay buffer, updates.
 
     Attributes:
         model: The model.
     """
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Make the environments and an untrained model."""
-        (cfg,), method = cfgs, cast(Any, cfgs[0].method)
+    def prepare(self, batch: EpisodeBatch) -> None:
+        (cfg,), method = [track.cfg for track in self.tracks], self.method
         self._kind: ModelKind = family(method.family).rules[method.algorithm].what
         rollout = self._kind.rollout_steps
         steps = batch.horizon if rollout is None else rollout(method)
-        super().__init__(cfgs, batch, method.num_envs * steps)
+        self.set_cycle(batch, method.num_envs * steps)
         self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
         self._envs = PlabVecEnv(batch)
         self._envs.together = True
@@ -108,13 +106,13 @@ class Sb3Training(Training):
 
     def cycle(self) -> None:
         # The library's log entries stay in its logger.
-        watch = ConvertCallback(lambda known, _: self._note(known["infos"]))
+        watch = ConvertCallback(lambda known, _: self._watch(known["infos"]))
         self.model.learn(self._cycle_steps, callback=watch, log_interval=None, reset_num_timesteps=False)
 
-    def _note(self, infos: Sequence[Mapping[str, Any]]) -> bool:
+    def _watch(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
             self._ended += infos
-            self.report()
+            self.report(self.episodes, self._shown)
         return True
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
@@ -158,12 +156,6 @@ class Sb3Training(Training):
 
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
         return self.model.policy, None
-
-
-class Sb3Runner(PolicyRunner):
-    """Runner of a model."""
-
-    training = Sb3Training
 
 
 class _Replay(LibraryBuffer):

@@ -14,16 +14,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from plab.config import Config, ranges
+from plab.config import ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.actors import ActorConfig, ActorTraining, actor_network, actor_policy
 from plab.runners.policy import Spaces, set_rate
-from plab.runners.training import PolicyRunner
+from plab.runners.training import ActorConfig, ActorRunner, actor_network, actor_policy
 
 if TYPE_CHECKING:
     from plab.envs.autograd import PolicySteps
@@ -59,15 +57,14 @@ class ShacConfig(ActorConfig):
     max_gradient_norm: float = field(metadata=ranges.POSITIVE)
 
 
-class ShacTraining(ActorTraining):
-    """Policy, value function, their optimisers, and training episodes."""
+class ShacRunner(ActorRunner):
+    """Runner of policy, value function, their optimisers, and training episodes."""
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
-        """Begin; the seed determines the initial weights, the noise of actions and the minibatches."""
-        super().__init__(cfgs, batch)
-        method = cfgs[0].method_as(ShacConfig)
+    def prepare(self, batch: EpisodeBatch) -> None:
+        super().prepare(batch)
+        method = self.method
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(cfgs[0].seed + 1)
+            torch.manual_seed(self._cfg.seed + 1)
             self._value = actor_network(self._spaces, 1, method.hidden).to(self._device)
         self._target = copy.deepcopy(self._value).requires_grad_(False)
         self._value_optimizer = torch.optim.Adam(self._value.parameters(), lr=method.value_lr)
@@ -92,7 +89,7 @@ class ShacTraining(ActorTraining):
         """Run one episode of all environments, window by window."""
         from plab.envs.autograd import policy_gradient
 
-        batch, method = self.batch, self._method
+        batch, method = self.batch, self.method
         parameters = list(self.network.parameters())
         _, info = batch.reset(episode=self.episodes // batch.size)
         initial = torch.as_tensor(info["loss"], dtype=torch.float32, device=self._device)
@@ -126,7 +123,7 @@ class ShacTraining(ActorTraining):
         self.note(train_reward=total, train_score=measured)
 
     def _learn_value(self, stretch: PolicySteps, rewards: torch.Tensor) -> None:
-        method = self._method
+        method = self.method
         seen = self.scaled(stretch.observations)
         with torch.no_grad():
             targets = td_lambda(rewards, self._target(seen)[..., 0], method.gamma, method.td_lambda)
@@ -162,10 +159,10 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 FAMILY = Family(
     label="a policy, trained through the simulator's gradient and by a value function",
     config=ShacConfig,
-    runner=PolicyRunner,
-    columns=ShacTraining.columns,
-    may_be_nan=ShacTraining.columns,
-    rules={"shac": Rule(ShacTraining, ShacConfig)},
+    runner=ShacRunner,
+    columns=ShacRunner.columns,
+    may_be_nan=ShacRunner.columns,
+    rules={"shac": Rule(ShacRunner, ShacConfig)},
     contact="hard",
     kind=GRADIENT,
     methods={"shac": Appearance("SHAC", "#DDAA33", ":")},

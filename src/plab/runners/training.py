@@ -1,14 +1,14 @@
-"""Training of one or several policies in lockstep, and their evaluation in the hard contact model.
+"""Bases of runners that train policies, one per run, and evaluate them in the hard contact model.
 
-A method's :class:`Training` holds the policies of a batch of runs. :class:`PolicyRunner` alternates between
-some episodes of training and one episode of each deterministic policy, which gives a row of the results.
+:class:`PolicyRunner` alternates between some episodes of training and one episode of each deterministic
+policy, which gives a row of the results. :class:`ActorRunner`, the base of ``shac``, ``pods`` and ``bc``,
+trains one policy, with its networks, state and random scenes.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,22 +18,33 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
-from plab.config import Config, ConfigError
+from plab.config import Config, ConfigError, ranges
 from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
 from plab.plugins import torch
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.policy import Moments, PolicyConfig, save_policy, torch_settings
+from plab.runners.policy import (
+    CLIP,
+    Moments,
+    Policy,
+    PolicyConfig,
+    Spaces,
+    first_policy,
+    packed,
+    save_policy,
+    torch_settings,
+    unpacked,
+)
 from plab.runners.runner import (
     FINAL_STATE_COLUMNS,
     Runner,
     SimulatorCache,
     Step,
+    TogetherError,
     Track,
     episode_columns,
     simulator_key,
 )
-from plab.runners.tracks import TogetherError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -42,6 +53,10 @@ if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
     from plab.envs.tensors import TensorEnv
     from plab.runners.agents import ReplayBuffer
+
+DEVIATION_MIN = 0.01
+"""Least standard deviation for scaling observations [domain units, domain units / s]. Otherwise nearly
+constant entries, scaled up, would dominate the gradient through the policy."""
 
 NOT_FINITE = "the policy's actions are not finite"
 
@@ -134,15 +149,22 @@ class TrainingSummary:
     losses: Mapping[str, float] = field(default_factory=dict)
 
 
-class Training(ABC):
-    """Policies in training, one per run, in cycles of a batch of episodes or an update.
+def whole_cycles(steps: int, cycle: int) -> int:
+    """Round transitions up to whole cycles."""
+    return math.ceil(steps / cycle) * cycle
+
+
+class PolicyRunner(Runner, ABC):
+    """Base of runners of policies in lockstep; each iteration consists of some training episodes and one
+    evaluation episode per policy.
+
+    Training proceeds in cycles of a batch of episodes or an update. All runs are at the same evaluation; if
+    one fails, the others restart without it.
 
     Attributes:
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
         watched: Losses of the updates are requested.
-        report: Function to call when episodes have ended.
-        provenance: Further entries of the results' provenance.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
@@ -152,39 +174,25 @@ class Training(ABC):
     """Episodes per environment in a cycle, and episodes with gradient."""
 
     simulates, tf32, watched = True, False, False
-    report: Callable[[], None]
 
-    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch, cycle: int) -> None:
-        """Begin a training of ``method.episodes`` episodes, in cycles with the given number of transitions
-        per policy."""
-        self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
-        self.total_steps = whole_cycles(cfgs[0].method_as(PolicyConfig).episodes * self._horizon, cycle)
-        self.report = lambda: None
-        self.provenance: dict[str, Any] = {}
+    # ------------------------------------------------------------------------------------------------ hooks
 
-    @classmethod
-    def environments(cls, cfg: Config) -> list[Config]:
+    def environments(self, cfg: Config) -> list[Config]:
         """Return the configurations of a run's training environments; none if it needs no simulations."""
         return [cfg] * cast(Any, cfg.method).num_envs
+
+    @abstractmethod
+    def prepare(self, batch: EpisodeBatch) -> None:
+        """Create the untrained policies, given the environments, and call :meth:`set_cycle`."""
 
     @property
     @abstractmethod
     def steps(self) -> int:
         """Number of transitions per policy so far."""
 
-    @property
-    def episodes(self) -> int:
-        """Number of complete episodes per policy so far."""
-        return self.steps // self._horizon
-
-    def train(self, episodes: int) -> None:
-        """Train until each policy has completed a number of episodes, or all transitions."""
-        while self.episodes < episodes and self.steps < self.total_steps:
-            self.cycle()
-
     @abstractmethod
     def cycle(self) -> None:
-        """Train for one cycle."""
+        """Train for one cycle, and report the progress."""
 
     @abstractmethod
     def decide(self, observations: Tensor) -> Tensor:
@@ -212,42 +220,34 @@ class Training(ABC):
     def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
         """Return a policy as a Stable-Baselines3 policy, and the scaling of its observations, if any."""
 
+    # ------------------------------------------------------------------------------- shared implementation
 
-def whole_cycles(steps: int, cycle: int) -> int:
-    """Round transitions up to whole cycles."""
-    return math.ceil(steps / cycle) * cycle
+    def set_cycle(self, batch: EpisodeBatch, cycle: int) -> None:
+        """Plan ``method.episodes`` episodes in cycles with the given number of transitions per policy."""
+        self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
+        self.total_steps = whole_cycles(self.method.episodes * self._horizon, cycle)
 
+    @property
+    def episodes(self) -> int:
+        """Number of complete episodes per policy so far."""
+        return self.steps // self._horizon
 
-class PolicyRunner(Runner):
-    """Runner of policies in lockstep; each iteration consists of some training episodes and one evaluation
-    episode per policy.
-
-    All runs are at the same evaluation; if one fails, the others restart without it.
-
-    Attributes:
-        training: Subclass of :class:`Training`, constructed from configurations and environments; None: that
-            of the algorithm's rule.
-        policies: The policies in training.
-    """
-
-    training: type[Any] | None = None
-    policies: Training
-    _shown = ""
-
-    def _kind(self) -> type[Any]:
-        return self.training or self._family.rules[self.method.algorithm].what
+    def train(self, episodes: int) -> None:
+        """Train until each policy has completed a number of episodes, or all transitions."""
+        while self.episodes < episodes and self.steps < self.total_steps:
+            self.cycle()
 
     def context(self) -> AbstractContextManager[Any]:
         # Large first layers dominate the time of an update on a GPU.
-        tf32 = self._kind().tf32 and self.method.torch_device == "cuda"
+        tf32 = self.tf32 and self.method.torch_device == "cuda"
         return torch_settings(self.method.torch_threads, tf32=tf32)
 
     def build(self) -> None:
         """Create the training environments, and the evaluation environments in the hard contact model."""
         from plab.envs.tensors import TensorEnv
 
-        cfgs, kind = [track.cfg for track in self.tracks], self._kind()
-        training = [one for cfg in cfgs for one in kind.environments(cfg)]
+        cfgs = [track.cfg for track in self.tracks]
+        training = [one for cfg in cfgs for one in self.environments(cfg)]
         if self.method.torch_device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
                 "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
@@ -255,83 +255,71 @@ class PolicyRunner(Runner):
         kinds = [(training, self.method.contact)] if training else []
         *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))
         self._judge, self.problem = TensorEnv(judge), judge.problem
-        self.policies = kind(cfgs, *own or [judge])
-        self.policies.watched = any(track.log.wanted for track in self.tracks)
-        for track in self.tracks:
-            track.run.result.provenance |= self.policies.provenance
+        self.watched = any(track.log.wanted for track in self.tracks)
+        self.prepare(*own or [judge])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Keep the initial policy, or restore policy and replay buffer from the file."""
         if state is None:
             return
-        self.policies.restore(track.number, state)
-        if self.has_more(track) and (found := self.policies.replay(track.number)):
+        self.restore(track.number, state)
+        if self.has_more(track) and (found := self.replay(track.number)):
             with track.results_errors():
-                found[0].read(found[1], _replay_path(track), self.policies.steps)
+                found[0].read(found[1], _replay_path(track), self.steps)
 
     def has_more(self, track: Track) -> bool:
         """Return whether training steps remain, or the initial policy has not been evaluated."""
-        return track.iteration == 0 or self.policies.steps < self.policies.total_steps
+        return track.iteration == 0 or self.steps < self.total_steps
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Train until the next evaluation is due, except before the first one, and evaluate all policies."""
         if len(tracks) < len(self.tracks):
             raise TogetherError("a run has failed")
-        training, start = self.policies, time.perf_counter()
-        before = training.steps
-        training.report = lambda: self.report(training.episodes, self._shown)
+        before = self.steps
         # The first evaluation, of the initial policies, compiles the kernels.
         if tracks[0].iteration > 0:
             self.enter("optimise")
             last = tracks[0].run.result.columns["episodes"][-1]
-            training.train(int(last) + self.method.evaluate_every)
+            self.train(int(last) + self.method.evaluate_every)
             self.enter("evaluate")
-        evaluations = evaluate(self._judge, training.decide)
-        learned, states = training.take(), training.states()
-        share = (time.perf_counter() - start) / len(tracks)
-        every, differentiated = training.round_episodes
-        simulated = training.steps - before if training.simulates else 0
+        evaluations = evaluate(self._judge, self.decide)
+        learned, states = self.take(), self.states()
+        every, differentiated = self.round_episodes
+        simulated = self.steps - before if self.simulates else 0
         gradient = simulated // every * differentiated
         for track, done, own, state in zip(tracks, evaluations, learned, states, strict=True):
-            start = time.perf_counter()
             if why := _unusable(track, own, done):
                 track.fail(why)
                 continue
             with track.results_errors():
-                if found := training.replay(track.number):
+                if found := self.replay(track.number):
                     found[0].write(found[1], _replay_path(track))
-                track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, training.steps)
+                track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, self.steps)
             if not track.open:
                 continue
             step = Step(
                 done.measures | own.measures,
                 done.actions,
                 state,
-                episodes=training.episodes,
-                steps=training.steps,
+                episodes=self.episodes,
+                steps=self.steps,
                 steps_forward=len(done.actions) + simulated - gradient,
                 steps_gradient=gradient,
-                seconds=share + time.perf_counter() - start,
-                keep=training.steps >= training.total_steps,
+                keep=self.steps >= self.total_steps,
                 whole=not done.failure,
             )
             yield track, step
 
     def extent(self) -> tuple[int, int, int]:
         """Return the numbers of finished and total episodes, and of episodes between evaluations."""
-        total = self.policies.total_steps // self.policies.batch.horizon
-        return self.policies.episodes, total, self.method.evaluate_every
+        return self.episodes, self.total_steps // self._horizon, self.method.evaluate_every
 
-    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report reward and score on average."""
-        reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
-        mean = "" if len(rows) == 1 else "mean "
-        self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
-        self.report(self.policies.episodes, self._shown)
+    def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
+        return f"reward {means['reward']:.4g} hard score {means['score']:.3f}"
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
-        save_policy(track.run.path, self.method, *self.policies.policy(track.number))
+        save_policy(track.run.path, self.method, *self.policy(track.number))
         _replay_path(track).unlink(missing_ok=True)
 
 
@@ -356,3 +344,166 @@ def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
             where = track.run.path, track.iteration, len(texts), name, texts[0]
             _log.warning("%s: iteration %d: %d %s diverged and were frozen, the first in %s", *where)
     return ""
+
+
+# ----------------------------------------------------------------------------------------------- one policy
+
+
+@dataclass
+class ActorConfig(PolicyConfig):
+    """Keys of methods that train a policy with the simulator's gradient, in one scene or many.
+
+    Attributes:
+        scenes: Number of random training scenes; 0: the run's own scene.
+        num_envs: Number of environments simulated together; more scenes are used in turn.
+    """
+
+    scenes: int = field(metadata=ranges.NOT_NEGATIVE)
+    num_envs: int = field(metadata=ranges.COUNT)
+
+
+def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.nn.Sequential:
+    """Return a network with ELU and LayerNorm after each hidden layer. Without LayerNorm, the hyperbolic
+    tangent of the actions saturates and learning stops."""
+    (entries,) = spaces.observation_space.shape
+    layers: list[torch.nn.Module] = []
+    for width in hidden:
+        layers += [torch.nn.Linear(entries, width), torch.nn.ELU(), torch.nn.LayerNorm(width)]
+        entries = width
+    return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
+
+
+def actor_policy(spaces: Spaces, hidden: Sequence[int]) -> Any:
+    """Return Stable-Baselines3's policy with the hyperbolic tangent of :func:`actor_network` as actions and
+    torch's default initial weights."""
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+    from stable_baselines3.td3.policies import Actor
+
+    network = actor_network(spaces, spaces.action_space.shape[0], hidden)
+    extractor = FlattenExtractor(spaces.observation_space)
+    policy = Actor(*spaces, net_arch=[], features_extractor=extractor, features_dim=extractor.features_dim)
+    policy.mu = network.append(torch.nn.Tanh())
+    return policy
+
+
+class ActorRunner(PolicyRunner):
+    """Base of runners of one policy, with its optimiser and training episodes.
+
+    Attributes:
+        network: The policy.
+        statistics: Moments of the observations, used for scaling.
+        broken: Times and reasons of the episodes that diverged since the last evaluation.
+    """
+
+    round_episodes, steps = (1, 1), 0
+
+    def environments(self, cfg: Config) -> list[Config]:
+        method: Any = cfg.method
+        if method.torch_device != cfg.sim.device:
+            raise ConfigError(
+                f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
+                f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
+            )
+        return training_scenes(cfg, method, method.num_envs)
+
+    def prepare(self, batch: EpisodeBatch) -> None:
+        """Begin; the configuration's seed determines the initial weights and all later random numbers."""
+        from stable_baselines3.common.running_mean_std import RunningMeanStd
+
+        self.set_cycle(batch, self.round_episodes[0] * batch.size * batch.horizon)
+        self._cfg, self._spaces = self.tracks[0].cfg, Spaces.of(batch)
+        self._device = torch.device(self.method.torch_device)
+        self.network: Any = first_policy(self.method, self._spaces, self._cfg.seed).to(self._device)
+        self._optimizer = torch.optim.Adam(self.network.parameters(), lr=self.method.lr)
+        self._generator = torch.Generator(self._device).manual_seed(self._cfg.seed)
+        self.statistics = RunningMeanStd(shape=self._spaces.observation_space.shape)
+        self._evaluated = 0
+        self.broken: list[str] = []
+        self._measured: dict[str, list[float]] = {}
+
+    @staticmethod
+    def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
+        """Return the initial policy, on the CPU."""
+        return actor_policy(spaces, method.hidden)
+
+    def cycle(self) -> None:
+        self.learn(1.0 - self.steps / self.total_steps)
+        self.steps += self._cycle_steps
+        self.report(self.episodes, self._shown)
+
+    @abstractmethod
+    def learn(self, rate_left: float) -> None:
+        """Run a round of training episodes; ``rate_left`` falls linearly from 1 to 0 over the training."""
+
+    def decide(self, observations: torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(Policy(self.network, *self._moments)(observations.cpu().numpy()))
+
+    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
+        return self.network, self._moments
+
+    @property
+    def _moments(self) -> Moments:
+        return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
+
+    def freeze_moments(self) -> None:
+        """Scale observations by the current moments from here on."""
+        mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self._moments)
+        self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
+
+    def scaled(self, observations: torch.Tensor) -> torch.Tensor:
+        """Scale observations by the moments of the last :meth:`freeze_moments`."""
+        return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
+
+    def note(self, **values: torch.Tensor | np.ndarray) -> None:
+        """Keep values of a round's episodes, shape [env], until :meth:`take`."""
+        for name, entries in values.items():
+            self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
+
+    def take(self) -> list[TrainingSummary]:
+        known, self._measured = self._measured, {}
+        broken, self.broken = self.broken, []
+        ended, self._evaluated = self.episodes - self._evaluated, self.episodes
+        means = {name: float(np.mean(known[name])) if name in known else np.nan for name in self.columns}
+        return [TrainingSummary(means, ended, broken)]
+
+    def states(self) -> list[dict[str, Any]]:
+        return [{"torch": packed(self.state())}]
+
+    def restore(self, run: int, state: Mapping[str, Any]) -> None:
+        self.load(unpacked(state["torch"]))
+
+    def learners(self) -> dict[str, Any]:
+        """Return networks and optimisers by name."""
+        return {"policy": self.network, "optimizer": self._optimizer}
+
+    def state(self) -> dict[str, Any]:
+        """Return the full training state, as tensors and numbers."""
+        moments = self.statistics.mean, self.statistics.var, self.statistics.count
+        return {
+            "steps": self.steps,
+            "generator": self._generator.get_state(),
+            "statistics": [torch.as_tensor(values, dtype=torch.float64) for values in moments],
+            **{name: one.state_dict() for name, one in self.learners().items()},
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`; RuntimeError if it belongs to other networks."""
+        for name, one in self.learners().items():
+            one.load_state_dict(state[name])
+        mean, var, count = state["statistics"]
+        self.statistics.mean, self.statistics.var = mean.numpy(), var.numpy()
+        self.statistics.count = float(count)
+        self._generator.set_state(state["generator"])
+        self.steps, self._evaluated = state["steps"], state["steps"] // self._horizon
+
+
+def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:
+    """Return the configurations of ``count`` training environments in a round: the run's own, or the next
+    random scenes that fit into the grid, repeated if there are fewer."""
+    from plab.problem import drawn_scenes
+
+    scenes = [cfg]
+    if method.scenes:
+        some = min(method.scenes, count)
+        scenes = drawn_scenes(cfg, [(turn * some + k) % method.scenes for k in range(some)])
+    return [scenes[k % len(scenes)] for k in range(count)]

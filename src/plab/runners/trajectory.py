@@ -9,7 +9,6 @@ result:
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -94,7 +93,6 @@ class TrajectoryRunner(Runner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Run the actions of all, and improve those of each by their gradient."""
-        start = time.perf_counter()
         tried = self.actions_at_rest()
         for track in tracks:
             tried[track.number] = self._rules[track.number].actions
@@ -116,7 +114,6 @@ class TrajectoryRunner(Runner):
         ahead = {track: self.iterations(track) - track.iteration - 1 for track in judging}
         due = [t for t in judging if ahead[t] == 0 or (t.iteration + 1) % CHECK_INTERVAL == 0]
         checks = self._check(due, [track for track in due if ahead[track] == 0])
-        share = (time.perf_counter() - start) / len(tracks)
         for track, row in rows.items():
             rule, finalists = self._rules[track.number], self._finalists[track.number]
             kept = finalists.keep_best() if track in checks else None
@@ -128,7 +125,6 @@ class TrajectoryRunner(Runner):
                 {"actions": rule.actions, "optimizer": dict(rule.state), "finalists": finalists.state()},
                 steps_forward=checks.get(track, 0) * len(rule.actions),
                 steps_gradient=len(rule.actions),
-                seconds=share,
                 # Until the first check those of the lowest loss are kept.
                 whole=np.isnan(finalists.kept_score) or track not in judging,
                 best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
@@ -155,16 +151,12 @@ class TrajectoryRunner(Runner):
                 rollouts[track] += 1
         return rollouts
 
-    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report the loss, and the score of the actions that are kept; see :class:`Finalists`."""
+    def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
+        """Return the loss, and the score of the actions that are kept; see :class:`Finalists`."""
         if all(track.cfg.protocol.score == "last" for track in tracks):
-            super().tell(rows, tracks)
-            return
-        mean = "" if len(rows) == 1 else "mean "
-        text = f"{mean}loss {np.mean([row['loss'] for row in rows]):.5g}"
-        if (kept := np.mean([row["kept_score"] for row in rows])) >= 0.0:
-            text += f" score of the best actions {kept:.3f}"
-        self.report(min(track.iteration for track in tracks), text)
+            return super().summary_line(means, tracks)
+        kept = f" score of the best actions {means['kept_score']:.3f}" if means["kept_score"] >= 0.0 else ""
+        return f"loss {means['loss']:.5g}{kept}"
 
 
 @dataclass

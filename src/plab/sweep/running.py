@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import itertools
 import json
+import multiprocessing
 import os
 import re
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import partial
@@ -32,13 +37,14 @@ from plab.problem import build_scenes
 from plab.results import ResultsError, RunFile, read, row_count
 from plab.results.running import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
-from plab.runners.runner import SimulatorCache
-from plab.runners.tracks import Outcome, report
+from plab.runners.runner import Outcome, SimulatorCache, report
 from plab.scenes import Scene, SceneError
 from plab.sim.batch import scene_kind
 from plab.sim.memory import batch_limit, most_environments
-from plab.sweep.gpus import gpu_workers
+from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
+
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
 """Function that executes batches, given a text for progress, and yields outcomes."""
@@ -83,7 +89,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
             for cfg in cfgs:
                 require_runnable(cfg)
             if settings["per_gpu"]:
-                carry, processes = stack.enter_context(gpu_workers(settings["per_gpu"], len(cfgs), look_up))
+                carry, processes = stack.enter_context(_gpu_workers(settings["per_gpu"], len(cfgs)))
         try:
             ended.extend(
                 run_batches(cfgs, carry, settings["batch_size"], processes, settings["per_gpu"] or 1)
@@ -314,3 +320,86 @@ def _finished_before(cfg: Config) -> Outcome | None:
     except ResultsError:
         return None
     return Outcome.of(cfg, "before", result.score) if result.status == "finished" else None
+
+
+# ------------------------------------------------------------------------------------------------------- GPUs
+
+
+@contextmanager
+def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Carrier, int]]:
+    """Start ``per_gpu`` processes on each GPU, at most ``most`` in all, for the duration of the ``with``
+    block; yield a function that executes batches with them, and their number. ConfigError if there is no
+    GPU."""
+    named = os.environ.get(VISIBLE)
+    found = range(cuda_devices()) if named is None else filter(None, named.split(","))
+    if not (names := [str(one).strip() for one in found]):
+        raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
+    # Processes are distributed evenly over GPUs.
+    places = names * per_gpu
+    pools = [_pool(name) for name in places[:most]]
+    try:
+        yield partial(_dispatch, pools, places), len(places)
+    except BaseException:
+        # After Ctrl-C: those that are at work write a checkpoint.
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        for pool in pools:
+            pool.shutdown(cancel_futures=True)
+
+
+def _dispatch(
+    pools: list[ProcessPoolExecutor],
+    places: Sequence[str],
+    batches: list[list[Config]],
+    progress: Callable[[], str],
+) -> Iterator[Outcome]:
+    """Give batches to free processes, and yield the outcomes."""
+    waiting, free = list(batches), list(range(len(pools)))
+    running: dict[Future[list[Outcome]], tuple[int, list[Config]]] = {}
+    while waiting or running:
+        while waiting and free:
+            number, batch = free.pop(0), waiting.pop(0)
+            note = f"GPU {places[number]} {progress()}"
+            running[pools[number].submit(_carry_out, batch, note)] = number, batch
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            number, batch = running.pop(future)
+            free.append(number)
+            try:
+                yield from future.result()
+            except BrokenProcessPool:
+                # Killed: the result files have its progress.
+                pools[number] = _pool(places[number])
+                yield from map(look_up, batch)
+
+
+# Inside the processes.
+_cache = SimulatorCache()
+
+
+def _pool(gpu: str) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (gpu,))
+
+
+def _begin(gpu: str) -> None:
+    os.environ[VISIBLE] = gpu
+    # Ctrl-C reaches all processes of a terminal: the one that has started this one sees to its end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _carry_out(batch: list[Config], note: str) -> list[Outcome]:
+    handler: Any = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return runners.run_batch(batch, note, _cache)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _end_with_parent() -> None:
+    """End this process, releasing its locks, when its parent ends."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
