@@ -394,7 +394,7 @@ class Runner:
                             with track.results_errors():
                                 rows.append(track.record(step, columns, seconds))
                         if rows:
-                            means = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
+                            means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
                             self._shown = "mean " * (len(rows) > 1) + self.summary_line(means, active)
                             self.report(self.extent()[0], self._shown)
             finally:
