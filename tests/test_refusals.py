@@ -12,7 +12,7 @@ import pytest
 
 import synthetic
 from plab import bench
-from plab.bench import accuracy, speed, stability
+from plab.bench import accuracy, speed
 from plab.cli import report, results, status
 from plab.cli.main import main as plab_main
 from plab.cli.rollouts import export, render, view
@@ -158,7 +158,6 @@ TOOLS = [
     (verify, "nowhere", "nowhere"),
     (leaderboard, "nowhere", "nowhere"),
     (speed.main, "--batch 0", "--batch"),
-    (stability.main, "--quick --family nothing", "nothing"),
     (accuracy.main, "--task Table", "Table"),
     (bench.main, "sped", "did you mean speed?"),
     (plab_main, "rnu", "choose from: run"),

@@ -2,8 +2,7 @@
 
     plab bench accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
     plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
-    plab bench accuracy --task Move,Rope --particles 3000
-    plab bench accuracy --device cuda --output accuracy_cuda
+    plab bench accuracy --task Move,Rope --device cuda
 
 Settings differ in the number of substeps, from below the stability limit upwards, in precision, in how the
 material is computed (series or singular values), in contact model, and in the grid, with as many particles
@@ -25,12 +24,12 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.command import Parser, command_line, folder, positive, task_list
+from plab.cli.command import Parser, command_line, folder, task_list
 from plab.cli.tables import measure_table
 from plab.config import build_scene
 from plab.demonstrations import known_actions
@@ -64,17 +63,8 @@ class UncheckedScene(Scene):
         return math.inf
 
 
-@dataclass(frozen=True)
-class Resolution:
-    """Discretisation and arithmetic of a simulation.
-
-    Attributes:
-        axis: Varied quantity: ``substeps`` or ``grid``.
-        grid: Grid nodes per axis.
-        substeps: Substeps per environment step.
-        precision: ``float32`` or ``float64``.
-        material: ``series`` or ``singular values``.
-    """
+class Setting(NamedTuple):
+    """Discretisation and arithmetic of a simulation; ``axis`` is the varied quantity."""
 
     axis: str
     grid: int
@@ -96,7 +86,6 @@ class Plan:
         steps: Environment steps.
         particles: Particles at ``grid``.
         repeats: Timed rollouts after the first, which compiles; the fastest counts.
-        device: ``cpu`` or ``cuda``.
     """
 
     grid: int = 64
@@ -107,24 +96,14 @@ class Plan:
     steps: int = 50
     particles: int = 10000
     repeats: int = 2
-    device: str = "cpu"
 
-    def of_grid(self, grid: int) -> Resolution:
-        """The suite's number of substeps per cell width."""
-        return Resolution("grid", grid, round(self.usual * grid / self.grid))
-
-    def settings(self) -> list[Resolution]:
-        """All settings except the references."""
-        out = [Resolution("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
-        out += [Resolution("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
-        return out + [self.of_grid(n) for n in self.grids[:-1]]
-
-    def references(self) -> dict[str, Resolution]:
-        """Reference by axis."""
-        return {
-            "substeps": Resolution("substeps", self.grid, self.reference),
-            "grid": self.of_grid(self.grids[-1]),
-        }
+    def settings(self) -> tuple[list[Setting], dict[str, Setting]]:
+        """Return the settings to compare, and the reference by axis."""
+        # The suite's number of substeps per cell width.
+        *coarse, finest = (Setting("grid", n, round(self.usual * n / self.grid)) for n in self.grids)
+        out = [Setting("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
+        out += [Setting("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
+        return out + coarse, {"substeps": Setting("substeps", self.grid, self.reference), "grid": finest}
 
 
 QUICK = Plan(32, (3, 5, 10, 20), 10, reference=80, grids=(24, 32, 40), steps=20, particles=1000, repeats=1)
@@ -135,13 +114,13 @@ class Result:
     """Outcome of one setting for a task in one contact model.
 
     Attributes:
-        x: Final positions, shape [particle, 3].
+        x: Initial, final and target positions, shape [particle, 3] each.
         gradient: Gradient of the loss per mass, shape [T, A].
         seconds: Run time of an environment step with gradient.
         outcome: ``stable``, or the failure.
     """
 
-    x: np.ndarray
+    x: tuple[np.ndarray, np.ndarray, np.ndarray]
     gradient: np.ndarray
     seconds: float
     outcome: str
@@ -153,77 +132,68 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
 
-def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
-    """Return particles on a regular lattice inside each body, shape [particle, 3] each; neighbours have a
-    distance of ``spacing`` [domain units]."""
-    out = []
-    for body in bodies:
-        half = body.half_extent()
-        counts = np.maximum(np.round(2.0 * half / spacing).astype(int), 1)
-        axes = [(np.arange(n) + 0.5) / n * 2.0 * h - h for n, h in zip(counts, half, strict=True)]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        if body.shape == "sphere":
-            points = points[np.linalg.norm(points, axis=1) <= body.size[0]]
-        out.append(np.asarray(body.center) + points)
-    return out
+def lattice(body: Body, spacing: float) -> np.ndarray:
+    """Return particles on a regular lattice inside a body, shape [particle, 3]; neighbours have a distance of
+    ``spacing`` [domain units]."""
+    half = body.half_extent()
+    counts = np.maximum(np.round(2.0 * half / spacing).astype(int), 1)
+    axes = [(np.arange(n) + 0.5) / n * 2.0 * h - h for n, h in zip(counts, half, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if body.shape == "sphere":
+        points = points[np.linalg.norm(points, axis=1) <= body.size[0]]
+    return np.asarray(body.center) + points
 
 
 class Attempt:
     """A task with test actions, and a target that they partially reach."""
 
-    def __init__(self, task: str, plan: Plan) -> None:
+    def __init__(self, task: str, plan: Plan, device: str) -> None:
         """Build the scene of the task's first variant."""
         cfg = with_particles([f"task={task}", "variant=1"], plan.particles)
-        self.task = task
-        self.scene = build_scene(cfg)
-        self.demonstration = cast(np.ndarray, known_actions(cfg))[: plan.steps]
-        self.ends: dict[str, np.ndarray] = {}
-        self._plan = plan
+        self._scene, self._plan, self._device = build_scene(cfg), plan, device
+        self._demonstration = cast(np.ndarray, known_actions(cfg))[: plan.steps]
+        self._ends: dict[str, np.ndarray] = {}
 
-    def start(self, setting: Resolution) -> tuple[Scene, np.ndarray]:
+    def _start(self, setting: Setting) -> tuple[Scene, np.ndarray]:
         """Return the scene of a setting and its particles.
 
         For grids, particles are on a lattice with a fixed number per cell, because random particles would add
         larger differences than the grids.
         """
-        plan, scene = self._plan, self.scene
+        plan, scene = self._plan, self._scene
+        x = sample_particles(scene)
         if setting.axis == "grid":
             volume = sum(body.volume for body in scene.bodies)
-            parts = lattice(scene.bodies, np.cbrt(volume / plan.particles) * plan.grid / setting.grid)
+            spacing = float(np.cbrt(volume / plan.particles)) * plan.grid / setting.grid
+            parts = [lattice(body, spacing) for body in scene.bodies]
             counted = zip(scene.bodies, parts, strict=True)
-            scene = replace(scene, bodies=tuple(replace(b, particles=len(x)) for b, x in counted))
+            scene = replace(scene, bodies=tuple(replace(b, particles=len(own)) for b, own in counted))
             x = np.concatenate(parts)
-        else:
-            x = sample_particles(scene)
-        changes = {
-            "grid_size": setting.grid,
-            "substeps": setting.substeps,
-            "dt": STEP_TIME / setting.substeps,
-        }
+        dt = STEP_TIME / setting.substeps
+        changes = {"grid_size": setting.grid, "substeps": setting.substeps, "dt": dt}
         return UncheckedScene(**vars(scene) | changes), x
 
-    def run(self, setting: Resolution, repeats: int) -> dict[str, Result]:
+    def run(self, setting: Setting, repeats: int) -> dict[str, Result]:
         """Simulate and time one setting, and return a result per contact model. The first setting of an axis
         determines the target, as the final state of the demonstration."""
-        scene, x = self.start(setting)
+        scene, x = self._start(setting)
         simulator = Simulator(
             [scene],
             # The suite's terms of the mass tensor.
             terms=make_terms({"density": 10.0, "sdf": 10.0}),
             precision=setting.precision,
-            device=self._plan.device,
+            device=self._device,
             particles=[x],
             _singular_values=setting.material != "series",
         )
-        if setting.axis not in self.ends:
+        if setting.axis not in self._ends:
             simulator.set_contact("hard")
-            simulator.rollout(self.demonstration[None], gradient=False)
-            self.ends[setting.axis] = simulator.state().x[0]
-        end = self.ends[setting.axis]
-        mass = scene.particle_mass * scene.particle_count
+            simulator.rollout(self._demonstration[None], gradient=False)
+            self._ends[setting.axis] = simulator.state().x[0]
+        end, mass = self._ends[setting.axis], scene.particle_mass * scene.particle_count
         target = spread_mass(end, scene.grid_size, mass / len(end))
         simulator.set_target(target[None], target_sdf(target, 0.1 * scene.particle_mass)[None])
-        actions, found = ACTION_SCALE * self.demonstration[None], {}
+        actions, found = ACTION_SCALE * self._demonstration[None], {}
         for contact in CONTACTS:
             simulator.set_contact(contact)
             seconds = []
@@ -232,44 +202,48 @@ class Attempt:
                 rollout = simulator.rollout(actions, strict=False)
                 seconds.append((time.perf_counter() - begin) / actions.shape[1])
             gradient = cast(np.ndarray, rollout.gradient)[0] / mass
-            outcome = next(iter(rollout.failures.values()), "stable")
-            found[contact] = Result(simulator.state().x[0], gradient, min(seconds[1:] or seconds), outcome)
+            outcome, ends = next(iter(rollout.failures.values()), "stable"), (x, simulator.state().x[0], end)
+            found[contact] = Result(ends, gradient, min(seconds[1:] or seconds), outcome)
         return found
 
-    def errors(self, setting: Resolution, result: Result, exact: Result, grid: int) -> dict[str, float]:
-        """Return the errors of a result by column, NaN if not applicable; mass tensors are compared on
-        ``grid`` nodes per axis."""
-        errors = dict.fromkeys(ERRORS, math.nan)
-        if result.outcome != "stable":
-            return errors
-        positions = (self.start(setting)[1], result.x, exact.x, self.ends[setting.axis])
-        initial, found, right, target = (spread_mass(x, grid, 1.0 / len(x)) for x in positions)
-        if setting.axis == "substeps":
-            errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
-        errors["mass"] = float(np.abs(found - right).sum())
-        judged = [scores(initial, tensor, target).score for tensor in (found, right)]
-        errors["score"] = abs(judged[0] - judged[1])
-        lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
-        if all(lengths):
-            # Without contact the gradient is zero and has no direction.
-            errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
-            errors["angle_deg"] = angle(result.gradient, exact.gradient)
+
+def errors_of(result: Result, exact: Result, grid: int, *, same_particles: bool) -> dict[str, float]:
+    """Return the errors of a result by column, NaN if not applicable; mass tensors are compared on ``grid``
+    nodes per axis."""
+    errors = dict.fromkeys(ERRORS, math.nan)
+    if result.outcome != "stable":
         return errors
+    start, x, end = result.x
+    initial, found, right, target = (spread_mass(p, grid, 1.0 / len(p)) for p in (start, x, exact.x[1], end))
+    if same_particles:
+        errors["positions"] = float(np.sqrt(((x - exact.x[1]) ** 2).sum(axis=1).mean()))
+    errors["mass"] = float(np.abs(found - right).sum())
+    judged = [scores(initial, tensor, target).score for tensor in (found, right)]
+    errors["score"] = abs(judged[0] - judged[1])
+    lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
+    if all(lengths):
+        # Without contact the gradient is zero and has no direction.
+        errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
+        errors["angle_deg"] = angle(result.gradient, exact.gradient)
+    return errors
 
 
-def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
+def rows(tasks: Sequence[str], plan: Plan, device: str) -> Iterator[dict[str, Any]]:
     """Run a plan; yield a row of :data:`COLUMNS` per task, setting and contact model."""
-    grids = {"substeps": plan.grid, "grid": plan.grids[0]}
+    settings, references = plan.settings()
     for task in tasks:
-        attempt = Attempt(task, plan)
-        exact = {axis: attempt.run(setting, 0) for axis, setting in plan.references().items()}
-        for setting in plan.settings():
+        attempt = Attempt(task, plan, device)
+        exact = {axis: attempt.run(setting, 0) for axis, setting in references.items()}
+        for setting in settings:
+            same = setting.axis == "substeps"
             for contact, result in attempt.run(setting, plan.repeats).items():
-                errors = attempt.errors(setting, result, exact[setting.axis][contact], grids[setting.axis])
-                yield vars(setting) | {
+                nodes = plan.grid if same else plan.grids[0]
+                errors = errors_of(result, exact[setting.axis][contact], nodes, same_particles=same)
+                yield {
+                    **setting._asdict(),
                     "task": task,
                     "contact": contact,
-                    "particles": len(result.x),
+                    "particles": len(result.x[1]),
                     "ms_per_step": f"{1e3 * result.seconds:.3f}",
                     **{name: f"{value:.3g}" for name, value in errors.items()},
                     "outcome": result.outcome,
@@ -284,26 +258,27 @@ def main(argv: Sequence[str]) -> None:
     from plab.report.figures import diagrams, save, style
 
     parser = Parser("plab bench accuracy", __doc__)
-    parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
+    add = parser.add_argument
+    add(
+        "--quick",
+        action="store_true",
+        help="coarser, fewer settings, 1000 particles instead of 10000, 20 steps",
+    )
     text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"
-    parser.add_argument("--task", type=task_list, help=text)
-    text = "particles per environment (10000; 1000 with --quick)"
-    parser.add_argument("--particles", type=positive, help=text)
-    parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
-    parser.add_argument("--output", type=folder, default=Path("accuracy"), help="folder to write to")
+    add("--task", type=task_list, help=text)
+    add("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
+    add("--output", type=folder, default=Path("accuracy"), help="folder to write to")
     options = parser.parse_intermixed_args(argv)
     if unknown := set(options.task or ()) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
-    plan = QUICK if options.quick else Plan()
-    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
     tasks, output = options.task or (QUICK_TASKS if options.quick else TASKS), options.output
-    output.mkdir(parents=True, exist_ok=True)
-    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
+    found = rows(tasks, QUICK if options.quick else Plan(), options.device)
+    table = measure_table(COLUMNS, found, output / "accuracy.csv")
     with style():
         drawings = diagrams(pd.DataFrame(table))
     save(drawings, output, "plab bench accuracy")
     for drawing in drawings:
-        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
+        print(output / f"{drawing.name}.png")
 
 
 if __name__ == "__main__":

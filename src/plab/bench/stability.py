@@ -2,8 +2,7 @@
 
     plab bench stability                      # everything, in both precisions
     plab bench stability --quick              # a few minutes on two cores
-    plab bench stability --precision float32 --particles 1000 --csv cases.csv
-    plab bench stability --quick --family "1000 steps"
+    plab bench stability --precision float32 --csv cases.csv
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
 steps, and of first variants over 1000. Every case is simulated forwards and backwards. A case passes if
@@ -21,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.command import Parser, command_line, positive, to_write
+from plab.cli.command import Parser, command_line, to_write
 from plab.cli.tables import measure_table, print_table
-from plab.config import ConfigError, build_scene
+from plab.config import build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms
 from plab.scenes import CONTACTS, PRECISIONS
@@ -34,9 +33,6 @@ MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 
 HOLD = 10
 """Longest duration of a bang-bang action [environment steps]."""
-
-HORIZON = 50
-"""Environment steps of the suite's cases."""
 
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
@@ -58,30 +54,23 @@ def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.nda
 ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
 
 
-def rows(
-    families: Mapping[str, tuple[Sequence[str], Sequence[str], int]], particles: int, precision: str
-) -> Iterator[dict[str, object]]:
-    """Run the cases of some families, each of tasks, variants and environment steps, one task at a time;
-    yield a row of :data:`COLUMNS` per case."""
-    number = itertools.count(1)
-    for family, (tasks, variants, steps) in families.items():
-        for task in tasks:
-            cases = list(itertools.product(variants, ACTIONS, CONTACTS))
-            words = ([f"task={task}", f"variant={variant}"] for variant in variants)
-            scenes = [build_scene(with_particles(own, particles)) for own in words]
-            scenes = [scene for scene in scenes for _ in range(len(cases) // len(variants))]
-            rngs = (np.random.default_rng(next(number)) for _ in cases)
-            actions = [
-                ACTIONS[kind](rng, steps, scenes[0].action_dim)
-                for (_, kind, _), rng in zip(cases, rngs, strict=True)
-            ]
-            simulator = stress_simulator(scenes, precision, contact_weight=1.0)
-            simulator.set_contact([contact for *_, contact in cases])
-            for (variant, kind, contact), found in zip(
-                cases, stress(simulator, np.stack(actions)), strict=True
-            ):
-                name = f"{task}-v{variant} {kind} {contact}"
-                yield {"precision": precision, "family": family, "case": name, **found}
+def rows(precision: str, quick: bool) -> Iterator[dict[str, object]]:
+    """Run all cases, one task at a time; yield a row of :data:`COLUMNS` per case."""
+    tasks, number = suite_tasks(), itertools.count(1)
+    short = [("suite", task, SUITE_VARIANTS[:1] if quick else SUITE_VARIANTS, 50) for task in tasks]
+    long = [("1000 steps", task, ("1",), 1000) for task in (["Move"] if quick else tasks)]
+    for family, task, variants, steps in short + long:
+        cases = list(itertools.product(variants, ACTIONS, CONTACTS))
+        words = {variant: [f"task={task}", f"variant={variant}"] for variant in variants}
+        built = {name: build_scene(with_particles(own, 64 if quick else 300)) for name, own in words.items()}
+        scenes = [built[variant] for variant, *_ in cases]
+        size = scenes[0].action_dim
+        actions = [ACTIONS[kind](np.random.default_rng(next(number)), steps, size) for _, kind, _ in cases]
+        simulator = stress_simulator(scenes, precision, contact_weight=1.0)
+        simulator.set_contact([contact for *_, contact in cases])
+        for (variant, kind, contact), found in zip(cases, stress(simulator, np.stack(actions)), strict=True):
+            name = f"{task}-v{variant} {kind} {contact}"
+            yield {"precision": precision, "family": family, "case": name, **found}
 
 
 def stress_simulator(scenes: Sequence[Any], precision: str, contact_weight: float) -> Simulator:
@@ -155,24 +144,12 @@ def summarise(rows: Iterable[Mapping[str, object]]) -> int:
 def main(argv: Sequence[str]) -> int:
     """Simulate the cases, print, write the requested file; return the exit code."""
     parser = Parser("plab bench stability", __doc__)
-    parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
+    what = "one variant of each task, 64 particles instead of 300"
+    parser.add_argument("--quick", action="store_true", help=what)
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
-    parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
-    text = "environment steps of the long horizon (1000)"
-    parser.add_argument("--horizon", type=positive, default=1000, help=text)
-    parser.add_argument("--family", nargs="+", help="families of cases")
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     options = parser.parse_intermixed_args(argv)
-    quick, tasks = options.quick, suite_tasks()
-    families = {
-        "suite": (tasks, SUITE_VARIANTS[:1] if quick else SUITE_VARIANTS, HORIZON),
-        f"{options.horizon} steps": (["Move"] if quick else tasks, ["1"], options.horizon),
-    }
-    if unknown := set(options.family or ()) - set(families):
-        raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
-    chosen = {name: cases for name, cases in families.items() if name in (options.family or families)}
-    particles = options.particles or (64 if quick else 300)
-    each = (rows(chosen, particles, precision) for precision in options.precision)
+    each = (rows(precision, options.quick) for precision in options.precision)
     return summarise(measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv))
 
 

@@ -23,8 +23,8 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
-from plab.report.statistics import AXES, Rows, Series, Summary, band, load_series
-from plab.report.tables import Cell, compare, ordered_tasks, settings_note
+from plab.report.statistics import AXES, Rows, Series, band, load_series
+from plab.report.tables import compare, ordered_tasks, settings_note
 from plab.report.writing import origin
 from plab.results.run_file import replace_file
 
@@ -56,13 +56,14 @@ class Page:
             command: Command that makes the page.
         """
         self.shown, self._out = best_runs(runs), out
-        cells = compare(runs, "task") | compare(runs, "configuration")
+        by_task, by_configuration = (
+            {key: _by_method(own) for key, own in compare(runs, unit).groupby(keys)}
+            for unit, keys in (("task", "task"), ("configuration", ["task", "variant"]))
+        )
         tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
         self._content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
-            "tasks": [
-                {"task": task, "cells": _by_method(cells, runs, task)} for task in tasks if task in with_runs
-            ],
+            "tasks": [{"task": task, "cells": by_task[task]} for task in tasks if task in with_runs],
             "gallery": [
                 {"task": one.task, "name": one.name, "method": one.best}
                 | {"seed": one.run["seed"], "score": _finite(one.run["score"])}
@@ -77,7 +78,7 @@ class Page:
         self._configurations: list[dict[str, Any]] = [
             {"name": f"{task}-v{variant}", "task": task, "variant": variant}
             | {"best": best.get(f"{task}-v{variant}")}
-            | {"cells": _by_method(cells, runs, task, variant)}
+            | {"cells": by_configuration[task, variant]}
             for task in tasks
             for variant in runs.variants
         ]
@@ -126,19 +127,16 @@ def _finite(value: float) -> float | None:
     return None if math.isnan(value) else round(float(value), 4)
 
 
-def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -> dict[str, Any]:
-    """Return our score, the paper's, and their difference, by method, for a task or one of its variants."""
-
-    def shown(one: Summary, expected: int) -> dict[str, Any]:
-        numbers = {"mean": _finite(one.mean), "std": _finite(one.std)}
-        return numbers | {"count": one.count, "expected": expected}
-
+def _by_method(cells: pd.DataFrame) -> dict[str, Any]:
+    """Return our score, the paper's, and their difference, by method, of rows of a comparison."""
     found = {}
-    for name in runs.methods:
-        cell = cells[(*which, name)]
-        gap = [_finite(value) for value in vars(cell.difference).values()]
-        ours, paper = shown(cell.ours, cell.expected), shown(cell.paper, 0)
-        found[name] = {"ours": ours, "paper": paper, "difference": gap}
+    for row in cells.to_dict("records"):
+        ours = {"mean": _finite(row["mean"]), "std": _finite(row["std"])}
+        ours |= {"count": row["runs"], "expected": row["expected"]}
+        paper = {"mean": _finite(row["paper_mean"]), "std": _finite(row["paper_std"])}
+        paper |= {"count": row["paper_runs"], "expected": 0}
+        gap = [_finite(row[name]) for name in ("difference", "low", "high")]
+        found[row["method"]] = {"ours": ours, "paper": paper, "difference": gap}
     return found
 
 

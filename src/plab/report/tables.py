@@ -114,55 +114,53 @@ INTERVAL = f"{CONFIDENCE:.0%} interval"
 """Heading of intervals."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """Scores of a method for a task, or one of its variants.
+def compare(runs: Runs, unit: str) -> pd.DataFrame:
+    """Compare our scores with the paper's.
 
-    Attributes:
-        ours: Mean, standard deviation and number of our runs.
-        expected: Expected number of runs.
-        paper: The paper's values; for a part of a method those of the whole method.
-        difference: Ours minus the paper's; for a task the mean over common variants.
+    Args:
+        runs: Our runs.
+        unit: ``task``, or ``configuration`` for a row per variant.
+
+    Returns:
+        Columns task, variant (if ``unit`` is ``configuration``), method; mean, std and runs of our scores,
+        and the expected number of runs; ``paper_mean``, ``paper_std`` and ``paper_runs``, for a part of a
+        method those of the whole method; difference (ours minus the paper's, for a task the mean over common
+        variants) with its interval, low and high.
     """
-
-    ours: Summary
-    expected: int
-    paper: Summary
-    difference: Interval
-
-
-def compare(runs: Runs, unit: str) -> dict[tuple[str, ...], Cell]:
-    """Return cells by task and method, or by task, variant and method if ``unit`` is ``configuration``."""
     groups = runs.table.groupby(["task", "variant", "method"])["score"]
     scores = {key: own.to_numpy(float) for key, own in groups}
-    whole, single = _numbers_of_paper("iou_per_task"), _numbers_of_paper("iou_per_configuration")
-    by_task, each = [runs.variants], [[variant] for variant in runs.variants]
-    cells = {}
-    for task in ordered_tasks(runs.tasks):
-        for variants, name in itertools.product(by_task if unit == "task" else each, runs.methods):
-            of = method(name).of or name
-            own = [scores.get((task, variant, name), np.array([])) for variant in variants]
-            theirs = [_printed(single.get((task, variant, of)), 1) for variant in variants]
-            paper = _printed(whole.get((task, of)), len(SUITE_VARIANTS)) if unit == "task" else theirs[0]
-            gap = stratified_difference([summarise(values) for values in own], theirs)
-            key = (task, name) if unit == "task" else (task, *variants, name)
-            cells[key] = Cell(summarise(np.concatenate(own)), len(variants) * len(runs.seeds), paper, gap)
-    return cells
-
-
-def _printed(values: tuple[float, float] | None, variants: int) -> Summary:
-    return summarise([]) if values is None else Summary(*values, variants * PAPER_SEED_COUNT)
+    whole, single, nothing = (
+        _paper_scores("iou_per_task"),
+        _paper_scores("iou_per_configuration"),
+        summarise([]),
+    )
+    units = [runs.variants] if unit == "task" else [[variant] for variant in runs.variants]
+    rows = []
+    for task, variants, name in itertools.product(ordered_tasks(runs.tasks), units, runs.methods):
+        of = method(name).of or name
+        own = [scores.get((task, variant, name), np.array([])) for variant in variants]
+        theirs = [single.get((task, variant, of), nothing) for variant in variants]
+        paper = whole.get((task, of), nothing) if unit == "task" else theirs[0]
+        gap = stratified_difference([summarise(values) for values in own], theirs)
+        rows.append(
+            {"task": task, **({} if unit == "task" else {"variant": variants[0]}), "method": name}
+            | {**_numbers(summarise(np.concatenate(own))), "expected": len(variants) * len(runs.seeds)}
+            | {f"paper_{key}": value for key, value in _numbers(paper).items()}
+            | {"difference": gap.value, "low": gap.low, "high": gap.high}
+        )
+    return pd.DataFrame(rows)
 
 
 @functools.cache
-def _numbers_of_paper(name: str) -> Mapping[tuple[str, ...], tuple[float, float]]:
-    """Return mean and standard deviation by task, variant (if the table has variants) and method."""
+def _paper_scores(name: str) -> Mapping[tuple[str, ...], Summary]:
+    """Return the paper's scores by task, variant (if the table has variants) and method."""
+    count = PAPER_SEED_COUNT * (len(SUITE_VARIANTS) if name == "iou_per_task" else 1)
     rows = paper_table(name).itertuples(index=False, name=None)
-    return {tuple(key): (mean, std) for *key, mean, std in rows}
+    return {tuple(key): Summary(mean, std, count) for *key, mean, std in rows}
 
 
 def _in_paper(name: str) -> bool:
-    return any(key[-1] == (method(name).of or name) for key in _numbers_of_paper("iou_per_task"))
+    return any(key[-1] == (method(name).of or name) for key in _paper_scores("iou_per_task"))
 
 
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:
@@ -208,71 +206,55 @@ def iou_per_configuration(runs: Runs) -> list[Table]:
 def distances(runs: Runs) -> list[Table]:
     """Return the distances of final shapes from their targets, per task and method; empty if no run has
     them."""
-    measured = [name for name in DISTANCES if name in runs.table]
     shown, data = [], []
-    for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), measured):
-        line = [task, DISTANCES[name]]
-        for m in runs.methods:
-            own = runs.table.query("task == @task and method == @m")[name].dropna()
-            found = summarise(own.to_numpy(float))
-            line.append(mean_and_std(found, 3) if found.count else NOTHING)
-            data.append({"task": task, "distance": name, "method": m, **_numbers(found)})
-        shown.append(line)
-    labels = ["task", "distance", *(method(m).label for m in runs.methods)]
+    for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), DISTANCES):
+        if name not in runs.table:
+            continue
+        own = runs.table[runs.table["task"] == task]
+        found = {
+            m: summarise(own.loc[own["method"] == m, name].dropna().to_numpy(float)) for m in runs.methods
+        }
+        texts = (mean_and_std(one, 3) if one.count else NOTHING for one in found.values())
+        shown.append([task, DISTANCES[name], *texts])
+        data += [{"task": task, "distance": name, "method": m, **_numbers(one)} for m, one in found.items()]
+    cells = pd.DataFrame(shown, columns=["task", "distance", *(method(m).label for m in runs.methods)])
     notes = ["Mean ± standard deviation over variants and seeds [domain units].", *settings_note(runs)]
-    made = Table(
-        "distances",
-        "ours",
-        "Distance of the final shape from the target, plab",
-        pd.DataFrame(shown, columns=labels),
-        pd.DataFrame(data),
-        None,
-        notes,
-    )
-    return [made] if shown else []
+    title = "Distance of the final shape from the target, plab"
+    return [Table("distances", "ours", title, cells, pd.DataFrame(data), None, notes)] if shown else []
 
 
 def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
     """Return both forms of a table of scores; ``what`` describes the runs of means and spreads."""
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
-    columns = ["task", "variant"][: 1 if unit == "task" else 2]
-    cells = compare(runs, unit)
-    shown, bold, data, compared, differences = [], [], [], [], []
-    for key in dict.fromkeys(key[:-1] for key in cells):
-        line, where = [cells[(*key, m)] for m in runs.methods], dict(zip(columns, key, strict=True))
-        shown.append([*key, *(_text(cell.ours, cell.expected) for cell in line)])
-        bold.append([False] * len(columns) + _best(line, runs.methods))
-        for m, cell in zip(runs.methods, line, strict=True):
-            data.append({**where, "method": m, **_numbers(cell.ours), "expected": cell.expected})
-            if not _in_paper(m):
-                continue
-            gap = cell.difference
-            texts = {"plab": _text(cell.ours, cell.expected), "paper": _text(cell.paper, 0)}
-            texts |= {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)}
-            compared.append(where | {"method": method(m).label} | texts)
-            theirs = {f"paper_{k}": value for k, value in _numbers(cell.paper).items()}
-            gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
-            differences.append({**data[-1], **theirs, **gaps})
-    labels = [*columns, *(method(m).label for m in runs.methods)]
+    keys = ["task"] if unit == "task" else ["task", "variant"]
+    data = compare(runs, unit)
+    data["text"] = list(map(_text, data["mean"], data["std"], data["runs"], data["expected"]))
+    # Rows of a line are in the order of methods.
+    lines = [own for _, own in data.groupby(keys, sort=False)]
+    labels = [*keys, *(method(m).label for m in runs.methods)]
+    shown = pd.DataFrame([[*own[keys].iloc[0], *own["text"]] for own in lines], columns=labels)
+    bold = np.array([[False] * len(keys) + _best(own) for own in lines])
+    ours = data[[*keys, "method", "mean", "std", "runs", "expected"]]
+    common = data[data["method"].map(_in_paper)]
+    papers = list(map(_text, common["paper_mean"], common["paper_std"], common["paper_runs"]))
+    gaps = [Interval(*own) for own in common[["difference", "low", "high"]].itertuples(index=False)]
+    compared = common[keys].assign(method=[method(m).label for m in common["method"]], plab=common["text"])
+    compared = compared.assign(paper=papers, difference=[number(gap.value, sign=True) for gap in gaps])
+    compared[INTERVAL] = list(map(ends, gaps))
     mean, settings = f"Mean ± standard deviation {what}.", settings_note(runs)
+    notes, other = [mean, _BOLD, _INCOMPLETE, *settings], [_DIFFERENCE, *settings]
+    numbers = common.drop(columns="text")
     return [
-        Table(
-            *(name, "ours", f"{title}, plab", pd.DataFrame(shown, columns=labels), pd.DataFrame(data)),
-            *(np.array(bold), [mean, _BOLD, _INCOMPLETE, *settings], len(shown) > 60),
-        ),
-        Table(
-            *(name, "comparison", f"{title}, compared", pd.DataFrame(compared), pd.DataFrame(differences)),
-            *(None, [_DIFFERENCE, *settings], True),
-        ),
+        Table(name, "ours", f"{title}, plab", shown, ours, bold, notes, len(shown) > 60),
+        Table(name, "comparison", f"{title}, compared", compared, numbers, None, other, True),
     ]
 
 
-def _text(summary: Summary, expected: int) -> str:
+def _text(mean: float, std: float, count: int, expected: int = 0) -> str:
     """Format mean and standard deviation, and the number of runs if some are missing."""
-    count = f"{summary.count}/{expected}"
-    if not summary.count:
-        return count if expected else NOTHING
-    return mean_and_std(summary) + (f" ({count})" if summary.count < expected else "")
+    if not count:
+        return f"0/{expected}" if expected else NOTHING
+    return mean_and_std(Summary(mean, std, count)) + (f" ({count}/{expected})" if count < expected else "")
 
 
 def _numbers(summary: Summary) -> dict[str, float]:
@@ -280,17 +262,17 @@ def _numbers(summary: Summary) -> dict[str, float]:
     return {"mean": summary.mean, "std": summary.std, "runs": summary.count}
 
 
-def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
-    """Return the mask of the best cells per kind of method, as printed; none if a cell is incomplete."""
-    best = [False] * len(line)
+def _best(line: pd.DataFrame) -> list[bool]:
+    """Return the mask of the best methods per kind, as printed; none if a cell is incomplete."""
+    best = pd.Series(False, line["method"])
+    scores = line.set_index("method")
     for kind in (RL, GRADIENT):
-        own = [k for k, m in enumerate(methods) if method(m).kind == kind]
-        rivals = [k for k in own if _in_paper(methods[k]) or line[k].ours.count]
-        if rivals and all(line[k].ours.count >= line[k].expected for k in rivals):
-            highest = max(round(line[k].ours.mean, 2) for k in rivals)
-            for k in rivals:
-                best[k] = round(line[k].ours.mean, 2) == highest
-    return best
+        own = [m for m in scores.index if method(m).kind == kind]
+        rivals = scores.loc[[m for m in own if _in_paper(m) or scores.loc[m, "runs"]]]
+        if len(rivals) and (rivals["runs"] >= rivals["expected"]).all():
+            printed = rivals["mean"].map(lambda mean: round(mean, 2))
+            best[printed.index] = printed == printed.max()
+    return best.to_list()
 
 
 # -------------------------------------------------------------------------------------------------- agreement
@@ -310,13 +292,9 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
         Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
         minus the paper's) and agrees (whether that is within two standard deviations or the tolerance).
     """
-    columns = ["task", "variant", "method", "ours", "paper", "paper_std", "runs"]
-    rows = [
-        (*key, cell.ours.mean, cell.paper.mean, cell.paper.std, cell.ours.count)
-        for key, cell in compare(runs, "configuration").items()
-        if cell.ours.count and cell.paper.count
-    ]
-    cells = pd.DataFrame(rows, columns=columns)
+    cells = compare(runs, "configuration").query("runs > 0 and paper_runs > 0").reset_index(drop=True)
+    cells = cells.rename(columns={"mean": "ours", "paper_mean": "paper"})
+    cells = cells[["task", "variant", "method", "ours", "paper", "paper_std", "runs"]]
     apart = cells["ours"] - cells["paper"]
     allowed = np.maximum(2.0 * cells["paper_std"], TOLERANCE)
     return cells.assign(difference=apart, agrees=apart.abs() <= allowed)
