@@ -3,7 +3,7 @@
     plab bench speed                                       Move on the CPU
     plab bench speed --quick                               the same in less than a minute
     plab bench speed task=Rope sim.device=cuda --batch 1 64
-    plab bench speed --task Move,Torus --precision float32 float64
+    plab bench speed task=Move,Torus sim.precision=float32,float64
     plab bench speed --paper                               the paper's table of ten tasks
 
 Rows are printed immediately, and written to --csv. docs/benchmarks.md explains the columns.
@@ -18,22 +18,16 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from plab.bench.workload import (
-    FORWARD,
-    GRADIENT,
-    KINDS,
-    REWARD,
-    build,
-    peak_rss_mb,
-    time_calls,
-)
-from plab.cli.command import Parser, command_line, positive, task_list, to_write
+from plab.bench.workload import FORWARD, GRADIENT, KINDS, REWARD, build, peak_rss_mb, time_calls
+from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, load_config
+from plab.config.overrides import parse, prepared
 from plab.config.suite import suite_tasks
 from plab.errors import tell
 from plab.progress import show_line
 from plab.report.reference import paper_table
+from plab.sweep.running import jobs_of
 
 COLUMNS = (
     "task", "device", "precision", "batch", "grid", "particles", "what", "first_s", "median_ms", "min_ms",
@@ -116,9 +110,7 @@ def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, ob
 def main(argv: Sequence[str]) -> int:
     """Time environment steps, print, write the requested files; return 1 if a row needs too much memory."""
     parser = Parser("plab bench speed", __doc__)
-    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
-    parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
-    parser.add_argument("--precision", nargs="+", help="precisions, measured in sequence")
+    parser.add_argument("overrides", nargs="*", help="configurations, as for plab run -m: task=Move,Rope")
     parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
     parser.add_argument("--steps", type=positive, help="environment steps per rollout")
     parser.add_argument("--repeats", type=positive, help="timed rollouts")
@@ -127,25 +119,22 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     parser.add_argument("--paper", action="store_true", help="the paper's table beside ours")
     options = parser.parse_intermixed_args(argv)
-    if not options.task and not any(word.startswith("task=") for word in options.overrides):
-        options.task = list(suite_tasks()) if options.paper else ["Move"]
-    quick, batches = options.quick, options.batch
-    steps, repeats = options.steps or (5 if quick else 10), options.repeats or (3 if quick else 7)
+    words = prepared(options.overrides)
+    if "task" not in {one.key_or_group for one in parse(words)}:
+        words.append(f"task={','.join(suite_tasks()) if options.paper else 'Move'}")
+    cfgs = [load_config(own) for own in jobs_of(words, {})]
     # Taichi restarts for each precision, so precision is the outer loop.
-    each = itertools.product(options.precision or [None], options.task or [None])
-    words = [
-        [*options.overrides, *([f"task={task}"] if task else []), *([f"sim.precision={p}"] if p else [])]
-        for p, task in each
-    ]
+    cells = list(itertools.product(sorted(cfgs, key=lambda cfg: cfg.sim.precision), options.batch))
+    quick = options.quick
+    steps, repeats = options.steps or (5 if quick else 10), options.repeats or (3 if quick else 7)
     # Widths of columns that differ from the default.
     widths = {"what": max(map(len, KINDS)), "task": 10, "device": 6, "batch": 5, "grid": 4}
-    cells = list(itertools.product(words, batches))
     if options.paper:
-        lines = (paper_row(load_config(own), batch, steps, repeats) for own, batch in cells)
+        lines = (paper_row(*cell, steps, repeats) for cell in cells)
         measure_table(PAPER_COLUMNS, lines, options.csv, widths)
         return 0
     kinds = options.kinds or (QUICK_KINDS if quick else tuple(KINDS))
-    parts = (rows(load_config(own), batch, steps, repeats, kinds) for own, batch in cells)
+    parts = (rows(*cell, steps, repeats, kinds) for cell in cells)
     table = measure_table(COLUMNS, itertools.chain.from_iterable(parts), options.csv, widths)
     return 0 if len(table) == len(cells) * len(kinds) else 1
 

@@ -130,7 +130,7 @@ def verify(argv: Sequence[str]) -> int:
             (one.entry.configuration.name, one.entry.steps, one.entry.score, one.score, one.outcome)
             for one in verdicts
         ]
-        print_table(("configuration", "steps", "claimed", "score", "outcome"), rows, digits=4)
+        print_table(("configuration", "steps", "claimed", "score", "outcome"), rows)
         # One line suffices for policies that were not run.
         for why in dict.fromkeys(one.why for one in verdicts if one.why):
             tell(f"{path}: {why}")

@@ -118,7 +118,7 @@ def targets(argv: Sequence[str]) -> None:
     if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
         parser.error("--rebuild has no effect with targets.source: leave one of them out")
     table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])
-    print_table(list(table.columns), table.itertuples(index=False, name=None), digits=4)
+    print_table(list(table.columns), table.itertuples(index=False, name=None))
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if options.csv is not None:
         options.csv.parent.mkdir(parents=True, exist_ok=True)

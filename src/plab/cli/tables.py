@@ -63,16 +63,13 @@ def _write(path: Path, row: Iterable[object], mode: str) -> None:
         csv.writer(file, lineterminator="\n").writerow(row)
 
 
-def print_table(
-    columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text", digits: int = 6
-) -> None:
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text") -> None:
     """Print a table; missing values are empty, in JSON null.
 
     Args:
         columns: Names of the columns, in order.
         rows: A value for each column.
         form: ``text``, with columns of numbers aligned to the right, ``csv``, or ``json``, a list of objects.
-        digits: Digits of numbers with a fraction, as text.
     """
     cells = [[None if value is None or value != value else value for value in row] for row in rows]
     if form == "json":
@@ -82,7 +79,7 @@ def print_table(
     elif form == "csv":
         csv.writer(sys.stdout, lineterminator="\n").writerows([columns, *cells])
     else:
-        texts = [[_text(value, digits) for value in row] for row in cells]
+        texts = [[_text(value) for value in row] for row in cells]
         parts = []
         for name, *column in zip(columns, *texts, strict=True):
             width = max(map(len, (name, *column)))
@@ -92,7 +89,7 @@ def print_table(
             print("  ".join(line).rstrip())
 
 
-def _text(value: Any, digits: int) -> str:
+def _text(value: Any) -> str:
     if value is None or value != value:
         return ""
-    return f"{value:.{digits}g}" if isinstance(value, float) else " ".join(str(value).split())
+    return f"{value:.6g}" if isinstance(value, float) else " ".join(str(value).split())

@@ -30,7 +30,7 @@ def paper_table(name: str) -> pd.DataFrame:
     Args:
         name: ``iou_per_configuration`` (columns task, variant, method, iou_mean, iou_std), ``iou_per_task``
             (the same without variant), ``timing`` (task, forward_ms, forward_backward_ms) or
-            ``gradient_settings`` (method, key, value). Standard deviations are of the population.
+            ``settings`` (method, key, value). Standard deviations are of the population.
     """
     return _read(name).copy()
 

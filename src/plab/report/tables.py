@@ -8,7 +8,7 @@ import functools
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from plab.config.families import GRADIENT, RL
-from plab.config.suite import SUITE_VARIANTS, conf_folder, shipped_file
+from plab.config.suite import SUITE_VARIANTS, shipped_file
 from plab.report.collect import Runs
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, origin, paper_table
@@ -511,7 +510,23 @@ _GRADIENT_KEYS = {
 
 def hyperparameters() -> list[Table]:
     """Return the settings of all methods: ours beside the paper's."""
-    data = pd.DataFrame([*_rl_rows(), *_gradient_rows()])
+    # Composing needs Hydra.
+    from plab.config import load_config
+
+    paper, rows = paper_table("settings").set_index(["method", "key"])["value"], []
+    for name in (*RL_METHODS, *_GRADIENT_KEYS):
+        shipped = shipped_file("method", name)
+        if name in RL_METHODS:
+            values, rates = shipped["profiles"]["release"], {}
+        else:
+            content, rates = load_config([f"method={name}"]).method, shipped["lr_by_task"]["plab"]
+            values = {key: getattr(content, key) for key in _GRADIENT_KEYS[name]}
+        for key, value in values.items():
+            own = rates.items() if key == "lr" else ()
+            exceptions = [f"; {_value(rate)} on {task}" for task, rate in own if rate != value]
+            ours, theirs = _value(value) + "".join(exceptions), paper.get((name, key), "")
+            rows.append({"method": name, "key": key, "plab": ours, "paper": theirs})
+    data = pd.DataFrame(rows)
     shown = data.replace("", NOTHING).assign(method=data["method"].map(lambda name: method(name).label))
     bold = np.zeros(shown.shape, dtype=bool)
     bold[:, 2:] = ((data["plab"] != data["paper"]) & data["paper"].ne("")).to_numpy()[:, None]
@@ -522,33 +537,6 @@ def hyperparameters() -> list[Table]:
     ]
     title = "Hyper-parameters, compared"
     return [Table("hyperparameters", "comparison", title, shown, data, bold, notes, True)]
-
-
-def _rl_rows() -> Iterator[dict[str, str]]:
-    for name in RL_METHODS:
-        text = (conf_folder() / "method" / f"{name}.yaml").read_text(encoding="utf-8")
-        profiles = yaml.safe_load(text)["profiles"]
-        # The comment on each value of the profile says whether the paper prints it.
-        paper = re.split(r"\n(?!    )", text.split("\n  paper:", 1)[1], maxsplit=1)[0]
-        printed = re.findall(r"^    (\w+):.*?#\s*(?!not printed|\s)(?=.*printed)", paper, re.MULTILINE)
-        for key, value in profiles["release"].items():
-            theirs = _value(profiles["paper"][key]) if key in printed else ""
-            yield {"method": name, "key": key, "plab": _value(value), "paper": theirs}
-
-
-def _gradient_rows() -> Iterator[dict[str, str]]:
-    # Composing needs Hydra.
-    from plab.config import load_config
-
-    paper = paper_table("gradient_settings").set_index(["method", "key"])["value"]
-    for name, keys in _GRADIENT_KEYS.items():
-        content = load_config([f"method={name}"]).method
-        for key in keys:
-            value = getattr(content, key)
-            rates = shipped_file("method", name)["lr_by_task"]["plab"] if key == "lr" else {}
-            exceptions = [f"; {_value(rate)} on {task}" for task, rate in rates.items() if rate != value]
-            theirs = _value(yaml.safe_load(str(paper[name, key])))
-            yield {"method": name, "key": key, "plab": _value(value) + "".join(exceptions), "paper": theirs}
 
 
 def _value(value: Any) -> str:
