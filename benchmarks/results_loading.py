@@ -62,7 +62,7 @@ def measure(runs: int, rows: int, packed: bool) -> Iterator[dict[str, object]]:
         if not packed:
             return
         archive = folder / "all.plab.zip.xz"
-        yield timed("pack", lambda: range(pack(results, archive).runs))
+        yield timed("pack", lambda: range(pack(results, archive)[0]))
         time.sleep(SETTLE)
         yield timed("archive", lambda: load(archive))
         yield timed("archive again", lambda: load(archive))

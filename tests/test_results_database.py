@@ -141,9 +141,9 @@ def test_a_run_with_damaged_iterations_is_named_and_left_out_everywhere(folder: 
         assert len(load(folder)) == 3
     with pytest.warns(UserWarning, match=path.name):
         assert ask(folder, "SELECT count(DISTINCT run) FROM iterations") == [(3,)]
-    found, packed = collect(folder, Selection()), pack(folder, folder.parent / "all.plab.zip.xz")
+    found, (packed, bad) = collect(folder, Selection()), pack(folder, folder.parent / "all.plab.zip.xz")
     assert len(load_series(found)) == 3 and path.name in found.left_out[-1]
-    assert packed.runs == 3 and path.name in str(packed.unreadable)
+    assert packed == 3 and path.name in str(bad)
 
 
 def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:

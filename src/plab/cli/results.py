@@ -88,11 +88,11 @@ def _check(argv: Sequence[str]) -> int:
     options = parser.parse_intermixed_args(argv)
     count = wrong = 0
     for source in sources_and_words(options.sources)[0]:
-        for _, fault in check(source):
+        for path, fault in check(source):
             count += 1
-            if fault is not None:
+            if fault:
                 wrong += 1
-                print(f"{fault.path}: {fault.reason}", flush=True)
+                print(f"{path}: {fault}", flush=True)
     advice = "; delete these files and run them again, or run them with force=true" if wrong else ""
     print(f"{count} run(s) checked, {wrong} faulty{advice}")
     return 1 if wrong else 0
@@ -110,15 +110,9 @@ def _pack(argv: Sequence[str]) -> None:
     chosen = select(words, SELECTABLE)
     if words:
         require_possible(chosen, rows(sources)[0])
-    done = pack(
-        sources,
-        options.output,
-        wanted=lambda row: chosen(row.values, row.config),
-        digits=options.digits,
-    )
-    _report_skipped(done.unreadable)
-    before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
-    print(f"{options.output}: {done.runs} run(s), {done.archive_bytes / 1e3:.1f} kB{before}")
+    count, unreadable = pack(sources, options.output, chosen, options.digits)
+    _report_skipped(unreadable)
+    print(f"{options.output}: {count} run(s), {options.output.stat().st_size / 1e3:.1f} kB")
 
 
 def _unpack(argv: Sequence[str]) -> None:

@@ -27,7 +27,7 @@ from plab.results.schema import (
 
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack
-    from plab.results.checking import Fault, check
+    from plab.results.checking import check
     from plab.results.query import connect
     from plab.results.table import Row, load, read_curves, rows
 
@@ -35,7 +35,6 @@ __all__ = [
     "BUDGETS",
     "SCHEMA_VERSION",
     "STATUSES",
-    "Fault",
     "NewerSchemaError",
     "ResultsError",
     "Row",
@@ -59,7 +58,7 @@ __all__ = [
 
 _MODULES = {
     "archive": ("pack", "unpack"),
-    "checking": ("Fault", "check"),
+    "checking": ("check",),
     "query": ("connect",),
     "table": ("Row", "load", "read_curves", "rows"),
 }

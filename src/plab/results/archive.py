@@ -11,43 +11,26 @@ import io
 import lzma
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from plab.config.run import member_name
+from plab.config.selection import Selection
 from plab.results.run_file import encode, read, replace_file
 from plab.results.schema import ARCHIVE_SUFFIX, ResultsError, RunResult
 from plab.results.table import Row, rows
 
 
-@dataclass(frozen=True)
-class ArchiveSummary:
-    """Summary of :func:`pack`.
-
-    Attributes:
-        runs: Number of runs in the archive.
-        archive_bytes: Size of the archive.
-        file_bytes: Total size of the runs' files; runs from archives count 0.
-        unreadable: Errors of unreadable files, which are not in the archive.
-    """
-
-    runs: int
-    archive_bytes: int
-    file_bytes: int
-    unreadable: list[ResultsError]
-
-
 def pack(
     source: str | Path | Sequence[str | Path],
     archive: str | Path,
-    *,
-    wanted: Callable[[Row], bool] = lambda row: True,
+    chosen: Selection | None = None,
     digits: int | None = None,
-) -> ArchiveSummary:
+) -> tuple[int, list[ResultsError]]:
     """Write finished runs into an archive, in one atomic step, without mass tensors, which can be recomputed
     from the best actions.
 
@@ -57,9 +40,12 @@ def pack(
     Args:
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
-        wanted: Predicate of the runs to include.
+        chosen: Selection of runs; None: all.
         digits: Least number of significant digits of the iterations, >= 1; None: all. four reduce the size by
             two thirds. Actions and the final evaluation keep all digits.
+
+    Returns:
+        Number of runs in the archive, and the errors of unreadable files, which are not in it.
 
     Raises:
         ResultsError: If there is nothing to pack, none of the files or archives in ``source`` can be read,
@@ -69,26 +55,24 @@ def pack(
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = rows(source)
-    chosen: dict[str, Row] = {}
+    packed: dict[str, Row] = {}
     for row in found:
-        if row.values["status"] == "finished" and wanted(row):
+        if row.values["status"] == "finished" and (chosen is None or chosen(row.values, row.config)):
             name = member_name(row.config, row.values["config_hash"]).as_posix()
-            if (other := chosen.setdefault(name, row)) is not row:
+            if (other := packed.setdefault(name, row)) is not row:
                 raise ResultsError(f"{row.path} and {other.path} are runs of one configuration: remove one")
-    if not chosen:
+    if not packed:
         raise ResultsError(
             "there is nothing to pack: no run fits" + (f"; {unreadable[0]}" if unreadable else "")
         )
     members = []
-    for name, row in sorted(chosen.items()):
+    for name, row in sorted(packed.items()):
         run = read(row.path)
         # Paths are meaningless on other computers.
         run = replace(run, config=run.config | {"results_dir": "results"}, masses={})
         members.append((name, encode(run if digits is None else _rounded(run, digits), compress=False)))
-    size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
-    replace_file(archive, content, sync=True)
-    return ArchiveSummary(len(members), len(content), size, unreadable)
+    replace_file(archive, lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9), sync=True)
+    return len(members), unreadable
 
 
 def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
