@@ -18,6 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from plab.bench.workload import with_particles
 from plab.cli.command import Parser, command_line, to_write
@@ -129,15 +130,12 @@ def _outcome(simulator: Simulator, e: int, state: State, mass: np.ndarray, speed
 
 def summarise(rows: Iterable[Mapping[str, object]]) -> int:
     """Print the number of passed cases per family; return the exit code."""
-    survived: dict[tuple, list[bool]] = {}
-    for row in rows:
-        survived.setdefault((row["precision"], row["family"]), []).append(row["outcome"] == "survived")
-    every = [one for own in survived.values() for one in own]
-    counts = [(*which, len(own), sum(own)) for which, own in survived.items()]
+    table = pd.DataFrame(rows)
+    passed = table["outcome"] == "survived"
+    counts = passed.groupby([table["precision"], table["family"]], sort=False).agg(["size", "sum"])
     print()
-    columns = ("precision", "family", "cases", "survived")
-    print_table(columns, [*counts, ("", "all", len(every), sum(every))])
-    return 0 if all(every) else 1
+    print_table(("precision", "family", "cases", "survived"), counts.reset_index().itertuples(index=False))
+    return 0 if passed.all() else 1
 
 
 @command_line

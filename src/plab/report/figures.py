@@ -340,7 +340,7 @@ _MARKS = {"series": "o", "singular values": "s"}
 
 def diagrams(table: pd.DataFrame) -> list[Drawing]:
     """Draw run time against each kind of error, one figure per task and varied quantity, with a panel per
-    contact model and kind; without run times, errors are drawn against the varied quantity.
+    contact model and kind.
 
     Args:
         table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.measured`.
@@ -351,21 +351,19 @@ def diagrams(table: pd.DataFrame) -> list[Drawing]:
     for (varied, task), own in table.groupby(["axis", "task"], sort=False):
         contacts = list(dict.fromkeys(own["contact"]))
         columns = [column for column in _ERRORS if own[column].notna().any()]
-        timed = bool(own["ms_per_step"].notna().any())
         named = {"substeps": "substeps per step", "grid": "grid nodes per axis"}[str(varied)]
         figure, axes = grid(len(contacts), len(columns), width=2.2, height=2.0)
         for panel, (contact, column) in zip(axes.flat, itertools.product(contacts, columns), strict=True):
             shown = own[own["contact"] == contact].sort_values(varied)
-            _errors(panel, shown, "ms_per_step" if timed else str(varied), column, str(varied))
+            _errors(panel, shown, column, str(varied))
             panel.set_title(f"{task}, {contact} contact", pad=12)
-            across = "ms per step with gradient" if timed else named
-            panel.set(xscale="log", yscale="log", xlabel=across, ylabel=_ERRORS[column])
+            panel.set(xscale="log", yscale="log", xlabel="ms per step with gradient", ylabel=_ERRORS[column])
         legend(figure)
         out.append(Drawing(f"{task}_{varied}", figure, [f"Numbers: {named}.", *notes]))
     return out
 
 
-def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str) -> None:
+def _errors(panel: Axes, own: pd.DataFrame, column: str, varied: str) -> None:
     """Draw a line per precision and material, labelled with the varied quantity."""
     small: dict[str, Any] = {"fontsize": 5, "textcoords": "offset points"}
     for (precision, material), rows in own.groupby(["precision", "material"], sort=False):
@@ -373,11 +371,13 @@ def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str)
         label = precision if material == "series" else f"{precision}, {material}"
         stable = rows[rows["outcome"] == "stable"]
         errors = stable[column].clip(lower=_FLOOR)
-        panel.plot(stable[cost], errors, mark + dashes, color=colour, markersize=3.5, label=label)
-        for x, y, count in zip(stable[cost], errors, stable[varied], strict=True):
+        panel.plot(stable["ms_per_step"], errors, mark + dashes, color=colour, markersize=3.5, label=label)
+        for x, y, count in zip(stable["ms_per_step"], errors, stable[varied], strict=True):
             panel.annotate(str(count), (x, y), xytext=(2, 2), **small)
         # Diverged runs have no error; they are drawn at the upper edge.
         above: Any = panel.get_xaxis_transform()
-        for x, count in rows.loc[rows["outcome"] != "stable", [cost, varied]].itertuples(index=False):
+        for x, count in rows.loc[rows["outcome"] != "stable", ["ms_per_step", varied]].itertuples(
+            index=False
+        ):
             panel.plot(x, 1.0, "x", color=colour, transform=above, clip_on=False, markersize=4)
             panel.annotate(str(count), (x, 1.0), xytext=(0, 4), ha="center", xycoords=above, **small)
