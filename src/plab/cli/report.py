@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     parser = Parser("plab report", __doc__)
     add = parser.add_argument
-    add("what", choices=list(_MAKERS), help="kind of report")
+    add("what", choices=("tables", "curves", "notebooks", "html"), help="kind of report")
     add_sources(parser, "runs to take, e.g. task=Rope,Move seed=0,1,2")
     add("--out", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by plab bench speed --paper --csv, for the table of times"
@@ -55,22 +55,22 @@ def main(argv: Sequence[str]) -> None:
             "and results=example shows those that come with plab"
         )
     out = options.out or Path("reports") / options.what
-    made = _MAKERS[options.what](runs, options, out, shlex.join(["plab", "report", *argv]))
+    command = shlex.join(["plab", "report", *argv])
+    if options.what == "tables":
+        benchmark = None if options.speed is None else measured(options.speed, SPEED)
+        made = f"{len(write_tables(runs, out, command, benchmark))} tables"
+    elif options.what == "curves":
+        made = f"{len(write_curves(runs, out, command))} figures"
+    elif options.what == "notebooks":
+        made = _make_notebooks(options, out, command)
+    else:
+        made = _make_page(runs, options, out, command)
     print(f"{out}: {made} of {len(runs.table)} out of {runs.expected} runs")
     for line in runs.left_out:
         tell(line)
 
 
-def _make_tables(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
-    benchmark = None if options.speed is None else measured(options.speed, SPEED)
-    return f"{len(write_tables(runs, out, command, benchmark))} tables"
-
-
-def _make_curves(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
-    return f"{len(write_curves(runs, out, command))} figures"
-
-
-def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+def _make_notebooks(options: argparse.Namespace, out: Path, command: str) -> str:
     if options.bench is None:
         shipped = options.sources[0] in map(resolve, EXAMPLES)
         options.bench = measurements(EXAMPLES[0] if shipped else "reports/bench")
@@ -96,7 +96,3 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
         finally:
             page.write()
     return "index.html"
-
-
-_MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
-"""Functions that generate reports, by name; each returns a summary."""

@@ -92,13 +92,6 @@ def single(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes[0, 0]
 
 
-def draw_range(axes: Axes, name: str, x: Any, middle: Any, low: Any, high: Any) -> None:
-    """Draw a line of a method with a shaded range."""
-    look = method(name)
-    axes.plot(x, middle, color=look.colour, linestyle=look.dashes, label=look.label)
-    axes.fill_between(x, low, high, color=look.colour, alpha=0.18, linewidth=0)
-
-
 def legend(figure: Figure, columns: int | None = None) -> None:
     """Add a common legend above all axes, in as many columns as fit, or in the given number."""
     entries: dict[str, Any] = {}
@@ -176,7 +169,9 @@ def _rewards(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]]) -> None:
     """Draw mean and spread of the reward of all methods against episodes."""
     for name in runs.methods:
         if (one := band(tables.get(name, []), "episodes", "reward")) is not None:
-            draw_range(panel, name, one.x, one.mean, (one.mean - one.std).clip(0.0), one.mean + one.std)
+            look, low = method(name), (one.mean - one.std).clip(0.0)
+            panel.plot(one.x, one.mean, color=look.colour, linestyle=look.dashes, label=look.label)
+            panel.fill_between(one.x, low, one.mean + one.std, color=look.colour, alpha=0.18, linewidth=0)
     panel.set(ylim=(0.0, None), xscale="log" if tables else "linear")
 
 

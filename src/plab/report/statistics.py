@@ -80,12 +80,6 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
     return _around(value, [side for pair in pairs for side in pair], len(pairs))
 
 
-def stratified_mean(strata: Sequence[Summary]) -> Interval:
-    """Return the mean over the strata of their means, with the same interval as
-    :func:`stratified_difference`; NaN if a stratum has none."""
-    return _around(float(np.mean([one.mean for one in strata])), strata, len(strata))
-
-
 def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
     """Return a mean over ``count`` strata with its interval, from the contributions ``sides``."""
     if any(side.count < 2 for side in sides):
@@ -114,7 +108,8 @@ Strata = Sequence[np.ndarray]
 
 def interquartile_mean(strata: Strata) -> Interval:
     """Return the interquartile mean of all scores, with its percentile interval."""
-    scores, samples = np.concatenate(strata), _resampled(strata)
+    scores, rng = np.concatenate(strata), np.random.default_rng(_SEED)
+    samples = np.concatenate([_drawn(np.asarray(own), rng) for own in strata], axis=1)
     middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
     found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
     return _interval(*found)
@@ -148,12 +143,6 @@ _ENDS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 def _drawn(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return bootstrap samples of one stratum, shape [sample, run]."""
     return scores[rng.integers(0, len(scores), (RESAMPLES, len(scores)))]
-
-
-def _resampled(strata: Strata) -> np.ndarray:
-    """Return bootstrap samples of all strata, shape [sample, run of any stratum]."""
-    rng = np.random.default_rng(_SEED)
-    return np.concatenate([_drawn(np.asarray(scores), rng) for scores in strata], axis=1)
 
 
 def _interval(value: float, samples: np.ndarray) -> Interval:
@@ -344,4 +333,5 @@ def strata_of(series: Series, task: str) -> Mapping[str, list[list[Rows]]]:
 def at_budgets(strata: Sequence[Sequence[Rows]], budgets: np.ndarray) -> list[Interval]:
     """Return the mean score of some runs, by variant in ``strata``, at each budget."""
     values = [np.stack([scores_at(table, budgets) for table in runs]) for runs in strata]
-    return [stratified_mean([summarise(own[:, k]) for own in values]) for k in range(len(budgets))]
+    each = [[summarise(own[:, k]) for own in values] for k in range(len(budgets))]
+    return [_around(float(np.mean([own.mean for own in one])), one, len(one)) for one in each]

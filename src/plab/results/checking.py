@@ -85,7 +85,10 @@ def _iteration_checks(run: RunResult) -> list[Check]:
             ((np.diff(table[name]) >= 0).all(), f"{name} decrease")
             for name in ("episodes", "steps", *BUDGETS)
         ),
-        *((_in_unit_interval(table[name]), f"{name} leaves [0, 1]") for name in ("iou", "score")),
+        *(
+            (((table[name] >= 0) & (table[name] <= 1)).all(), f"{name} leaves [0, 1]")
+            for name in ("iou", "score")
+        ),
         ((table["iteration"] == np.arange(run.rows)).all(), "iterations are not numbered 0, 1, 2, ..."),
         (0 <= run.best_iteration < run.rows, f"there is no iteration {run.best_iteration}, the best one"),
         (run.best_loss == loss, f"the best loss is {run.best_loss:g}, that of its iteration {loss:g}"),
@@ -97,10 +100,6 @@ def _iteration_checks(run: RunResult) -> list[Check]:
     fits = shape[:1] == [horizon] and len(shape) == 2
     checks.append((fits, f"best actions have shape {shape}, not [{horizon}, A]"))
     return [*checks, ((np.abs(actions) <= 1.0).all(), "best actions leave [-1, 1]")]
-
-
-def _in_unit_interval(values: Any) -> bool:
-    return bool(((values >= 0.0) & (values <= 1.0)).all())
 
 
 def _evaluation_checks(run: RunResult) -> list[Check]:

@@ -188,12 +188,8 @@ def _of_run(row: Row) -> Entry:
     except RenderError as error:
         raise SubmissionError(str(error)) from None
     score = row.values["score_best"]
-    return Entry(configuration_of(cfg), checksum(cfg), steps_to_best(row), score, actions)
-
-
-def steps_to_best(row: Row) -> int:
-    """Return the number of environment steps simulated until a run found its best actions."""
-    return int(load_rows(row.path)["simulated"][row.values["best_iteration"]])
+    steps = int(load_rows(row.path)["simulated"][row.values["best_iteration"]])
+    return Entry(configuration_of(cfg), checksum(cfg), steps, score, actions)
 
 
 def from_policies(
