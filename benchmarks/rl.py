@@ -104,7 +104,9 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
     if torch.cuda.is_initialized():
         held = torch.cuda.max_memory_allocated()
     else:
-        held = sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
+        off = [one for one in population.stacks if isinstance(one, OffPolicyAgents)]
+        episodes = (one.sizes.capacity(one.method.buffer_size, one.total_steps) for one in off)
+        held = sum(4 * one.count * one.sizes.entries * k for one, k in zip(off, episodes, strict=True))
     return {
         "task": cfg.task.name,
         "device": f"{cfg.sim.device}/{method.torch_device}",
