@@ -10,7 +10,6 @@ import pytest
 
 import plab
 from plab.cli.dataset import main
-from plab.cli.run import main as run
 from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
 from plab.results import read
@@ -34,8 +33,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "method=adam", "method.iterations=2"]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
-    assert run(["-m", *words, f"results_dir={folder}/results", *COARSE]) == 0
-    assert main([f"{folder}/results", *seen, "--output", str(folder)]) == 0
+    assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder
 
 

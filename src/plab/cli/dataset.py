@@ -28,6 +28,7 @@ from plab.envs.core import EpisodeBatch
 from plab.envs.observations import mapped, spaces
 from plab.errors import ArgumentError, tell
 from plab.problem import build_scenes, fits
+from plab.results import read
 from plab.scenes import Camera
 
 REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVATION_KEYS)
@@ -48,6 +49,7 @@ def main(argv: Sequence[str]) -> None:
     """Write demonstrations as datasets in Minari's format, one per task.
 
     plab dataset KEY=VALUE ...                  the best known actions of tasks, or their targets' scripts
+    plab dataset KEY=VALUE ... method=NAME      actions that a method finds; its runs go to results_dir
     plab dataset RESULTS ... [KEY=VALUE ...]    the best actions of runs
 
     Words are those of plab run -m. RESULTS are folders, files, archives or a name such as example; words then
@@ -57,6 +59,7 @@ def main(argv: Sequence[str]) -> None:
     EXAMPLES
       plab dataset task=Move
       plab dataset task=Torus variant=random 'seed_scene=range(1000,1050)' observe_target=true
+      plab dataset task=Move variant=random 'seed_scene=range(1000,1050)' method=adam sim.device=cuda
       plab dataset example method=solve --observe state,depth
     """
     parser = Parser("plab dataset", main.__doc__)
@@ -95,7 +98,7 @@ def main(argv: Sequence[str]) -> None:
         kept = write_dataset(output, name, episodes, recorder.spaces, recorder.env_spec(), about)
         scores = [one["score"] for one in kept]
         rows.append([output / name, len(kept), len(own) - len(kept), np.mean(scores), min(scores)])
-    print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows)
+    print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows, digits=3)
 
 
 def _cameras(path: Path) -> dict[str, Camera]:
@@ -117,10 +120,6 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     from plab.sweep.running import compose_jobs, jobs_of
 
     given = {one.key_or_group for one in parse(prepared(words))}
-    if "method" in given:
-        raise ArgumentError(
-            "a method's actions are those of its runs: plab run -m ..., then plab dataset results"
-        )
     every = [] if "variant" in given else [f"variant={','.join(SUITE_VARIANTS)}"]
     cfgs = []
     for one in compose_jobs(jobs_of(prepared([*words, *every]), {}, config_dir), config_dir):
@@ -129,15 +128,30 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
         if one.seed_scene is None or fits(one):
             cfgs.append(one)
     require_runnable(cfgs[0])
+    if "method" in given:
+        return _solved(cfgs, options.together)
     found = []
     for cfg in cfgs:
         if (actions := known_actions(cfg)) is None:
             raise ArgumentError(
-                f"no actions are known for {cfg.task.name}, variant {cfg.variant}: find some with "
-                "plab run -m method=adam ..., then plab dataset results"
+                f"no actions are known for {cfg.task.name}, variant {cfg.variant}: add a method that finds "
+                "some, such as method=adam"
             )
         found.append(Demonstration(cfg, actions, "demonstration"))
     return found
+
+
+def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
+    """Execute runs, and return their best actions, without failed runs."""
+    from plab.sweep.running import carry_here, run_batches
+
+    for one in run_batches(cfgs, carry_here, together):
+        if not one.finished:
+            tell(f"{one.title}: {one.message}")
+    done = [(cfg, read(cfg.path).best_actions) for cfg in cfgs if cfg.path.is_file()]
+    if not done:
+        raise DatasetError("no run has finished")
+    return [Demonstration(cfg, best, cfg.method.name) for cfg, best in done if best is not None]
 
 
 def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstration]:
