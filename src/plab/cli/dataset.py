@@ -98,7 +98,7 @@ def main(argv: Sequence[str]) -> None:
         kept = write_dataset(output, name, episodes, recorder.spaces, recorder.env_spec(), about)
         scores = [one["score"] for one in kept]
         rows.append([output / name, len(kept), len(own) - len(kept), np.mean(scores), min(scores)])
-    print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows, digits=3)
+    print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows)
 
 
 def _cameras(path: Path) -> dict[str, Camera]:
