@@ -141,7 +141,7 @@ def test_a_term_of_ones_own_is_a_file_and_a_weight(tmp_path: Path) -> None:
     np.testing.assert_allclose(run.iterations["loss"], total, rtol=1e-6)
     assert run.labels["loss_height"].endswith("height above a surface [mass x domain units]")
     assert (run.iterations["loss_height"] > 0).all()
-    assert [problem for _, problem in check(tmp_path / "results")] == [None]
+    assert [problem for _, problem in check(tmp_path / "results")] == [""]
 
 
 NAMES = {"sdf": "sdf", "density": "density", "soft": "soft", "near": "nearest"}

@@ -207,7 +207,7 @@ def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
     run = read(row.path)
     assert run.config["protocol"]["name"] == "release"
     assert run.masses.keys() == {"initial", "final"}
-    assert [problem for _, problem in check(results)] == [None]
+    assert [problem for _, problem in check(results)] == [""]
     path = row.path
     again = record(*result(path))
     assert abs(again.score - run.evaluation["score"]) < 1e-6

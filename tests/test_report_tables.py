@@ -335,7 +335,7 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
     tables = {"authors": 8, "release": 10}.get(name, 9)
     assert f"{tables} tables of {count} out of" in capsys.readouterr().out
     if name != "authors":
-        assert all(problem is None for _, problem in check(example_archive(name)))
+        assert all(not problem for _, problem in check(example_archive(name)))
     page = (Path(__file__).parents[1] / "docs" / "reproduction.md").read_text("utf-8")
     for label, row in AGREEMENT.get(name, {}).items():
         (table,) = agreement(gather(example_archive(name)))
