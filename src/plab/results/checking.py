@@ -64,7 +64,7 @@ def faults(run: RunResult) -> list[str]:
 
 
 Check: TypeAlias = tuple[Any, str]
-"""Whether a requirement is met, and the fault if it is not."""
+"""Result of a requirement, true if it is met, and the fault to report otherwise."""
 
 
 def _iteration_checks(run: RunResult) -> list[Check]:
