@@ -95,7 +95,7 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
 
 def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     """Return the distance of every grid node to the nearest node of the target [domain units], shape [n, n,
-    n]. Nodes with a mass above ``threshold`` belong to the target; ValueError if there are none."""
+    n]. Nodes with a mass above ``threshold`` belong to the target; raise ValueError if there are none."""
     # Imported here, because SciPy would slow down every `--help`.
     from scipy.ndimage import distance_transform_edt
 

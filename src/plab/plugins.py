@@ -85,8 +85,8 @@ def exported_module_path() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes); ConfigError
-    if it cannot be imported or is of another kind."""
+    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes); raise
+    ConfigError if it cannot be imported or is of another kind."""
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
         raise ConfigError(f"'{text}' does not name an object: write module:NAME")

@@ -154,7 +154,8 @@ def sources_and_words(
 
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
-    """Return the finished runs that words choose, all of one protocol; ResultsError if there are none."""
+    """Return the finished runs that words choose, all of one protocol; raise ResultsError if there are
+    none."""
     from plab.results.schema import NAMES, ResultsError
     from plab.results.table import rows
 

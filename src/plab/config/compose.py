@@ -107,8 +107,8 @@ _KEPT: dict[tuple[Any, ...], bytes] = {}
 
 
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
-    """Return Hydra's composition of prepared overrides, without its own section; ConfigError if an override
-    or a file does not fit.
+    """Return Hydra's composition of prepared overrides, without its own section; raise ConfigError if an
+    override or a file does not fit.
 
     Hydra takes a tenth of a second. Configurations that differ only in values are composed once, and the
     values are set afterwards, as Hydra does.
@@ -223,7 +223,7 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
-    """Return copies of a configuration with random scenes (``variant=random``), one per ``seed_scene``;
+    """Return copies of a configuration with random scenes (``variant=random``), one per ``seed_scene``; raise
     ConfigError if the task is not an unmodified task of the suite, or has no section ``random``."""
     from plab.config.randomization import with_own_materials
 

@@ -92,7 +92,7 @@ class Family:
         return self.config if own is None or own.config is None else own.config
 
     def runner_type(self) -> type:
-        """Return the runner; ConfigError if it cannot be imported."""
+        """Return the runner; raise ConfigError if it cannot be imported."""
         return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
 
 
@@ -107,7 +107,7 @@ FAMILIES = Registry(
 
 
 def family(name: str) -> Family:
-    """Return the family of a key of :data:`FAMILIES`, or of the ``module:NAME`` of a record elsewhere;
+    """Return the family of a key of :data:`FAMILIES`, or of the ``module:NAME`` of a record elsewhere; raise
     ConfigError if there is none."""
     found: Family = FAMILIES.find(name, "method.family")
     return found

@@ -28,7 +28,7 @@ _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IG
 
 
 def prepared(words: Sequence[str]) -> list[str]:
-    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``;
+    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``; raise
     ConfigError for a text in place of a list."""
     if isinstance(words, str):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
@@ -53,7 +53,7 @@ def quoted(text: str) -> str:
 
 
 def parse(words: Sequence[str]) -> list[Override]:
-    """Parse overrides; ConfigError if one cannot be read."""
+    """Parse overrides; raise ConfigError if one cannot be read."""
     try:
         return [_parsed(word) for word in words]
     except HydraException as error:
@@ -69,7 +69,7 @@ def _parsed(word: str) -> Override:
 
 def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
     """Return the values that an override gives, as texts, such as ``seed=0,1`` or ``task=glob(R*)`` out of
-    ``names``; ConfigError if it gives none."""
+    ``names``; raise ConfigError if it gives none."""
     value = override.value()
     if isinstance(value, IntervalSweep):
         raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")
@@ -90,8 +90,8 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
 
 
 def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return the changes of a variant, given a task with all its variants; ConfigError if there is no such
-    variant."""
+    """Return the changes of a variant, given a task with all its variants; raise ConfigError if there is no
+    such variant."""
     if name not in task.variants:
         names = [*task.variants, *([RANDOM] if task.random else [])]
         advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'

@@ -48,8 +48,8 @@ Values = dict[str, Any]
 
 
 def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the lowest and highest values of sampled parameters, by dotted key, sorted; ConfigError if a
-    range is invalid, or its key cannot be randomised."""
+    """Return the lowest and highest values of sampled parameters, by dotted key, sorted; raise ConfigError if
+    a range is invalid, or its key cannot be randomised."""
     found: dict[str, tuple[Any, Any]] = {}
     for key, bounds in leaves(task.randomize):
         path = f"task.randomize.{key}"
@@ -67,8 +67,8 @@ def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
 
 
 def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
-    """Return the value of a randomised key as a number or a list of numbers; ConfigError, beginning with
-    ``path``, if the key cannot be randomised, or the value is invalid."""
+    """Return the value of a randomised key as a number or a list of numbers; raise ConfigError, with a
+    message that begins with ``path``, if the key cannot be randomised, or the value is invalid."""
     present = present_value(task, key, path)
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "iuf" or numbers.shape != np.shape(present):
@@ -80,8 +80,8 @@ def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
 
 
 def present_value(task: TaskConfig, key: str, path: str) -> Any:
-    """Return the value of a sampled key in the task itself; ConfigError, beginning with ``path``, if the key
-    cannot be randomised."""
+    """Return the value of a sampled key in the task itself; raise ConfigError, with a message that begins
+    with ``path``, if the key cannot be randomised."""
     group, *rest = key.split(".")
     if key in (NOISE, SCENE):
         return 0
@@ -184,8 +184,8 @@ _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
-    """Sample the changes of a random variant, in the structure of the entries of ``variants``; ConfigError if
-    the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid."""
+    """Sample the changes of a random variant, in the structure of the entries of ``variants``; raise
+    ConfigError if the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid."""
     if not task.random:
         raise ConfigError(
             f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"

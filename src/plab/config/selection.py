@@ -36,7 +36,7 @@ class Selection:
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     """Parse selections of a command line, such as ``seed=0,1`` or ``seed=range(3)``, by ``names`` and dotted
-    keys of the configuration; ArgumentError or ConfigError if one is invalid."""
+    keys of the configuration; raise ArgumentError or ConfigError if one is invalid."""
     if not words:
         return Selection()
     # Imported here, because Hydra is slow to import and not needed without overrides.
@@ -56,8 +56,8 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the name of the common protocol of some runs, plab's own for none; ArgumentError if there are
-    several, which must not be averaged."""
+    """Return the name of the common protocol of some runs, plab's own for none; raise ArgumentError if there
+    are several, which must not be averaged."""
     names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
     if len(names) > 1:
         advice = f"choose one, for example protocol.name={names[0]}"

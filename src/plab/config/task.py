@@ -169,8 +169,8 @@ class KinematicsConfig(ranges.Section):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
     def build(self) -> Chain:
-        """Return the scene's articulated model; ConfigError if it cannot be read or has changed, or a pattern
-        matches nothing."""
+        """Return the scene's articulated model; raise ConfigError if it cannot be read or has changed, or a
+        pattern matches nothing."""
         patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
         with located("task.kinematics"):
             chain = self._read().placed(self.position, self.rotation, self.free, **patterns)

@@ -130,7 +130,7 @@ def _described(space: Space[Any]) -> dict[str, Any]:
 
 def metadata_of(path: str | Path) -> dict[str, Any]:
     """Return the metadata of a dataset, a folder with the folder ``data`` or that folder itself, or
-    ``example``; with ``path``, the folder of its files. DatasetError if there is none."""
+    ``example``; with ``path``, the folder of its files. Raise DatasetError if there is none."""
     path = EXAMPLE if str(path) == "example" else Path(path).expanduser()
     for place in (path / "data", path):
         if (file := place / "metadata.json").is_file():
@@ -142,7 +142,8 @@ def metadata_of(path: str | Path) -> dict[str, Any]:
 
 
 def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episode]:
-    """Yield the episodes of a dataset, in order, at most ``limit``; DatasetError if it cannot be read."""
+    """Yield the episodes of a dataset, in order, at most ``limit``; raise DatasetError if it cannot be
+    read."""
     metadata = metadata_of(path)
     file = metadata["path"] / "main_data.hdf5"
     try:

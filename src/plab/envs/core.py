@@ -115,7 +115,7 @@ def compose_configs(
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """Return a render mode; ValueError if there is none of this name."""
+    """Return a render mode; raise ValueError if there is none of this name."""
     if render_mode not in (None, *METADATA["render_modes"]):
         raise ArgumentError(f"render_mode '{render_mode}' must be rgb_array or None")
     return render_mode
@@ -327,7 +327,7 @@ class EpisodeBatch:
 
     @property
     def problem(self) -> Problem:
-        """Scenes, targets and simulator of the batch; RuntimeError if the environment is closed."""
+        """Scenes, targets and simulator of the batch; raises RuntimeError if the environment is closed."""
         if self._problem is None:
             raise RuntimeError("the environment is closed: make a new one")
         return self._problem
@@ -521,7 +521,7 @@ class EpisodeBatch:
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state returned by :meth:`get_state` of a batch of the same kind, and return its
-        observations and ``info``; ValueError if a shape is wrong."""
+        observations and ``info``; raise ValueError if a shape is wrong."""
         self._simulator.set_state(state.simulation)
         changed = self.draws.put(dict(enumerate(state.values)))
         if self._stages:
@@ -592,7 +592,7 @@ class EpisodeBatch:
         return terms
 
     def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
-        """Return the steps taken in the episodes, shape [batch]; ResetNeeded if fewer remain in one."""
+        """Return the steps taken in the episodes, shape [batch]; raise ResetNeeded if fewer remain in one."""
         if self._steps is None:
             raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)
@@ -680,7 +680,8 @@ class Restorable:
     _arguments: dict[str, Any]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, state and random numbers; TypeError if the simulator was changed directly."""
+        """Return arguments, state and random numbers; raise TypeError if the simulator was changed
+        directly."""
         batch = self.batch
         if batch.changed_by_hand or batch.problem.simulator.changes != batch._changes:
             raise TypeError(

@@ -65,8 +65,8 @@ class EpisodeRandomizer:
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
         """Check that scenes can be simulated over the whole ranges, and build the random scenes.
 
-        ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; ConfigError if a
-        range is invalid.
+        ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; raise ConfigError
+        if a range is invalid.
         """
         self._problem: Problem | None = problem
         self._cfgs = list(cfgs)
@@ -220,7 +220,8 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
 
 
 def staged(cfg: Config) -> bool:
-    """Return True if the task has stages before its target; ConfigError if targets are randomised, too."""
+    """Return True if the task has stages before its target; raise ConfigError if targets are randomised,
+    too."""
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
         raise ConfigError("task.randomize cannot draw scenes or targets of a task with task.stages")
     return bool(cfg.task.stages)
@@ -236,8 +237,8 @@ class Stages:
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Build the targets; ``problem`` has those of the last stage. ConfigError if the sub-environments
-        differ in the number of stages."""
+        """Build the targets; ``problem`` has those of the last stage. Raise ConfigError if the
+        sub-environments differ in the number of stages."""
         if len({len(cfg.task.stages) for cfg in cfgs}) > 1:
             raise ConfigError("task.stages differ in number between sub-environments")
         self._targets = []

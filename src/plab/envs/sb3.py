@@ -129,7 +129,7 @@ class PlabVecEnv(VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all sub-environments; ValueError if for some only."""
+        """Set an attribute of all sub-environments; raise ValueError if for some only."""
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
         setattr(self, attr_name, value)

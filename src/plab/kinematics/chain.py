@@ -247,8 +247,8 @@ class Chain:
 
 
 def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:
-    """Return values by name from a table with patterns, regular expressions of whole names; ModelError, which
-    begins with ``key``, if one matches no name."""
+    """Return values by name from a table with patterns, regular expressions of whole names; raise ModelError,
+    with a message that begins with ``key``, if one matches no name."""
     found: dict[str, Any] = {}
     for pattern, value in table.items():
         try:

@@ -88,8 +88,8 @@ def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Ren
 
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
-    """Create the folder of a file, and yield a temporary path that replaces the file on success; RenderError
-    if it cannot be written."""
+    """Create the folder of a file, and yield a temporary path that replaces the file on success; raise
+    RenderError if it cannot be written."""
     fresh = path.with_name(f"{UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -206,8 +206,8 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
 
 
 def draw_strip(path: Path, picture: Path) -> None:
-    """Replay a run from its result file, and write start, target and end side by side as PNG; RenderError if
-    that is not possible."""
+    """Replay a run from its result file, and write start, target and end side by side as PNG; raise
+    RenderError if that is not possible."""
     require_graphics()
     try:
         save(record(*result(path)), picture, _PAGE_SIZE)

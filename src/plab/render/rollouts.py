@@ -65,8 +65,8 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
 
 
 def stored(path: Path) -> tuple[Config, np.ndarray]:
-    """Return the configuration for a replay, and the best actions of a result file; ResultsError if the file
-    cannot be read, RenderError if it has no actions yet, or they do not fit its task."""
+    """Return the configuration for a replay, and the best actions of a result file; raise ResultsError if the
+    file cannot be read, RenderError if it has no actions yet, or they do not fit its task."""
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
@@ -102,8 +102,8 @@ def _defaults() -> Config:
 
 
 def demonstration(cfg: Config) -> np.ndarray:
-    """Return the best known actions for a configuration, or zeros, shape [T, A]; RenderError if they do not
-    fit the scene."""
+    """Return the best known actions for a configuration, or zeros, shape [T, A]; raise RenderError if they do
+    not fit the scene."""
     # Imported here, because replaying a result does not need its tables.
     from plab.demonstrations import known_actions
 

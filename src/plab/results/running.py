@@ -290,7 +290,8 @@ class Lock:
     """A lock held by this process until :meth:`release` or garbage collection."""
 
     def __init__(self, path: str | Path, timeout: float = _PATIENCE) -> None:
-        """Acquire the lock of a run, as :func:`acquire` does; filelock.Timeout if it is held for longer."""
+        """Acquire the lock of a run, as :func:`acquire` does; raise filelock.Timeout if it is held for
+        longer."""
         file, often = lock_path(path), _PATIENCE / 8
         # The soft lock of a killed process would never be released.
         self._lock = FileLock(file, timeout, thread_local=False, poll_interval=often, fallback_to_soft=False)

@@ -225,8 +225,8 @@ class ReplayBuffer:
         )
 
     def write(self, agent: int, path: Path) -> None:
-        """Append an agent's new episodes to its file, so that the file covers every checkpoint; ResultsError
-        if that fails."""
+        """Append an agent's new episodes to its file, so that the file covers every checkpoint; raise
+        ResultsError if that fails."""
         since, last = self._written[agent], self.added // self._sizes.horizon
         try:
             with path.open("r+b" if since else "wb") as file:
@@ -240,7 +240,7 @@ class ReplayBuffer:
 
     def read(self, agent: int, path: Path, steps: int) -> None:
         """Load whole episodes of N environments from an agent's file, given the number of transitions, the
-        same for all agents; ResultsError if that fails."""
+        same for all agents; raise ResultsError if that fails."""
         added = steps // self._sizes.envs
         self._count_to(added)
         self._written[agent] = last = added // self._sizes.horizon

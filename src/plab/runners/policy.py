@@ -174,7 +174,7 @@ def save_policy(
     result: Path, method: PolicyConfig, policy: BasePolicy, moments: Moments | None = None
 ) -> None:
     """Write the policy file of a result, with the section ``method`` of its configuration and the moments
-    that scale observations, if any; ResultsError if that fails."""
+    that scale observations, if any; raise ResultsError if that fails."""
     arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
         space = cast("Box", getattr(policy, f"{name}_space"))

@@ -49,7 +49,7 @@ class RlRunner(PolicyRunner):
     tf32 = True
 
     def prepare(self, batch: EpisodeBatch) -> None:
-        """Build untrained agents; RunError if their replay buffers do not fit into memory."""
+        """Build untrained agents; raise RunError if their replay buffers do not fit into memory."""
         from plab.envs.tensors import TensorEnv
 
         cfgs, method = [track.cfg for track in self.tracks], self.method

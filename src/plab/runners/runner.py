@@ -165,7 +165,7 @@ class Track:
 
     def record(self, step: Step, columns: Sequence[str], seconds: float) -> dict[str, float]:
         """Write an iteration, with the measures of some columns and the run's share of the wall time, to the
-        file and return its row; ResultsError if the file cannot be written."""
+        file and return its row; raise ResultsError if the file cannot be written."""
         horizon, before = len(step.actions), sum(self._budget.values())
         episodes = before // horizon if step.episodes is None else step.episodes
         steps = episodes * horizon if step.steps is None else step.steps
@@ -301,8 +301,8 @@ class Runner:
             yield track, self.step(track)
 
     def step(self, track: Track) -> Step:
-        """Make one iteration of one run; SimulationError if a state, loss or gradient diverges, RunError if
-        it fails for another reason."""
+        """Make one iteration of one run; raise SimulationError if a state, loss or gradient diverges,
+        RunError if it fails for another reason."""
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
@@ -568,7 +568,7 @@ class RunLog:
         self._close: Callable[[], object] = lambda: None
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers by name at an environment step, leaving out non-finite ones; ResultsError if that
+        """Log numbers by name at an environment step, leaving out non-finite ones; raise ResultsError if that
         fails."""
         if not self.wanted:
             return

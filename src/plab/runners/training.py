@@ -209,8 +209,8 @@ class PolicyRunner(Runner, ABC):
 
     @abstractmethod
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Restore a policy from one of :meth:`states`; RuntimeError, ValueError or LookupError if it belongs
-        to other networks."""
+        """Restore a policy from one of :meth:`states`; raise RuntimeError, ValueError or LookupError if it
+        belongs to other networks."""
 
     def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
         """Return a policy's replay buffer and its number there, if it has one."""
@@ -487,7 +487,7 @@ class ActorRunner(PolicyRunner):
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; RuntimeError if it belongs to other networks."""
+        """Return to a :meth:`state`; raise RuntimeError if it belongs to other networks."""
         for name, one in self.learners().items():
             one.load_state_dict(state[name])
         mean, var, count = state["statistics"]

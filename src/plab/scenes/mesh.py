@@ -38,7 +38,7 @@ _TRIED = 1 << 15
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
     """Return the mesh of an OBJ, STL or PLY file, found by :func:`plab.files.pinned` and cached by content;
-    ShapeError if it cannot be read, or does not bound a solid."""
+    raise ShapeError if it cannot be read, or does not bound a solid."""
     return _loaded(*pinned(file, sha256))
 
 
@@ -48,7 +48,7 @@ def _loaded(file: str, sha256: str) -> Mesh:
 
 
 def read_mesh(file: str, **options: Any) -> Any:
-    """Read an OBJ, STL or PLY file with ``trimesh.load`` as one of trimesh's objects with vertices;
+    """Read an OBJ, STL or PLY file with ``trimesh.load`` as one of trimesh's objects with vertices; raise
     ShapeError if it cannot be read, or trimesh is not installed."""
     try:
         # Imported here, because it takes a second and is rarely needed.

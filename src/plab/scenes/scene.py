@@ -80,13 +80,13 @@ Vec3 = tuple[float, float, float]
 
 
 def vector3(values: Sequence[float]) -> Vec3:
-    """Return three numbers as a tuple; ValueError if they are not three."""
+    """Return three numbers as a tuple; raise ValueError if they are not three."""
     x, y, z = values
     return x, y, z
 
 
 def find_law(name: str) -> Law:
-    """Return a law by its name, or by ``module:NAME`` for a law outside plab; ConfigError if there is
+    """Return a law by its name, or by ``module:NAME`` for a law outside plab; raise ConfigError if there is
     none."""
     found: Law = LAWS.find(name, "law")
     return found

@@ -285,7 +285,8 @@ def excess(submission: Submission) -> str | None:
 
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
-    """Return an entry of the manifest with its actions; ValueError, KeyError or TypeError for mistakes."""
+    """Return an entry of the manifest with its actions; raise ValueError, KeyError or TypeError for
+    mistakes."""
     configuration = Configuration(record["task"], record["variant"])
     known = configuration.task in suite_tasks() and configuration.variant in VARIANTS
     _require(known, f"{where}: the leaderboard has no {configuration}")

@@ -328,8 +328,8 @@ def _finished_before(cfg: Config) -> Outcome | None:
 @contextmanager
 def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Carrier, int]]:
     """Start ``per_gpu`` processes on each GPU, at most ``most`` in all, for the duration of the ``with``
-    block; yield a function that executes batches with them, and their number. ConfigError if there is no
-    GPU."""
+    block; yield a function that executes batches with them, and their number. Raise ConfigError if there is
+    no GPU."""
     named = os.environ.get(VISIBLE)
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):

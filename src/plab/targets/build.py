@@ -63,7 +63,7 @@ def _made(pickled: bytes) -> Recipe:
 
 def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
     """Return the actions of a scripted target, in [-1, 1], shape [EPISODE_STEPS, A], or None for a target
-    without simulation; TargetError if a parameter has a wrong value."""
+    without simulation; raise TargetError if a parameter has a wrong value."""
     recipe: Any = make_recipe(target)
     return None if isinstance(recipe, TensorRecipe) else recipe.actions(scene)
 

@@ -41,7 +41,7 @@ class TensorRecipe(Recipe, ABC):
     @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
         """Return the mass tensor of a scene's target, shape [n, n, n], float64, with the scene's total mass;
-        TargetError if a parameter has a wrong value, or the shape leaves the domain."""
+        raise TargetError if a parameter has a wrong value, or the shape leaves the domain."""
 
 
 class PointsRecipe(TensorRecipe):
@@ -241,7 +241,7 @@ class MassTarget(TensorRecipe):
 
 @lru_cache(maxsize=8)
 def read_points(file: str, _sha256: str = "") -> np.ndarray:
-    """Return the positions in a NumPy, PLY or XYZ file, shape [point, 3], float64, cached by content;
+    """Return the positions in a NumPy, PLY or XYZ file, shape [point, 3], float64, cached by content; raise
     ShapeError if the file cannot be read, or holds no points."""
     kind = Path(file).suffix.lower()
     if kind == ".ply":

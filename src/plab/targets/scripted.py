@@ -64,7 +64,8 @@ class ActionTrack:
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; _TooLong if there are more."""
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if there are
+        more."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
@@ -100,8 +101,8 @@ class Script(Recipe):
         return {key: value for key, value in values.items() if value is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
-        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; TargetError if a parameter
-        has a wrong value, or no sampled path fits into an episode."""
+        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; raise TargetError if a
+        parameter has a wrong value, or no sampled path fits into an episode."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         rng, movers = np.random.default_rng(self.seed), [m for m in scene.tools if m.action_dim]
@@ -115,7 +116,7 @@ class Script(Recipe):
         )
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
-        """Draw actions once; _TooLong if they do not fit into an episode."""
+        """Draw actions once; raise _TooLong if they do not fit into an episode."""
         if not tracks:
             raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
         self.plan(scene, tracks, rng)
