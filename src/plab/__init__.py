@@ -1,4 +1,4 @@
-"""plab: PlasticineLab rebuilt as an experiment harness, from one command line to the result file."""
+"""plab: a benchmark for soft-body manipulation with differentiable physics."""
 
 from __future__ import annotations
 

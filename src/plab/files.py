@@ -82,7 +82,7 @@ def regular_file(path: Path) -> os.stat_result:
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Give an empty folder beside one that is not there, or empty, which takes its place if nothing fails."""
+    """Yield an empty folder that replaces a missing or empty one when the ``with`` block succeeds."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder.parent))
     try:
@@ -121,7 +121,7 @@ def read_members(path: Path, most: int = LARGEST) -> dict[str, bytes]:
 
     Raises:
         UnreadableError: If they would take more than ``most`` bytes.
-        ValueError: If it is no zip file, or damaged.
+        ValueError: If it is not a zip file, or damaged.
         OSError: If it cannot be opened.
     """
     with opened_zip(path) as archive:
@@ -194,7 +194,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
     Raises:
         UnreadableError: If it contains other data than numbers and text.
-        ValueError: If it is no such file, or damaged.
+        ValueError: If it is not such a file, or damaged.
         OSError: If it cannot be opened.
     """
     arrays = {}

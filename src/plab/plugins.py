@@ -42,7 +42,7 @@ class Registry(UserDict[str, Any]):
     """Objects by name, given as ``module:NAME`` and imported on first access."""
 
     def __init__(self, kind: type, places: Mapping[str, str]) -> None:
-        """Keep the places of instances of ``kind``; ``type`` for classes."""
+        """Store the ``module:NAME`` of instances of ``kind`` (``type`` for classes) by name."""
         super().__init__(places)
         self._kind = kind
 
@@ -52,8 +52,8 @@ class Registry(UserDict[str, Any]):
         return self.data[name]
 
     def find(self, name: str, key: str) -> Any:
-        """Return the object of a name or, elsewhere, of ``module:NAME``; ConfigError with the configuration's
-        key if there is none."""
+        """Return the object of a name or, outside the registry, of ``module:NAME``; raise ConfigError, which
+        names the configuration's key, if there is none."""
         if ":" in name:
             return load_object(name, self._kind)
         if name not in self:

@@ -195,7 +195,7 @@ class Problem:
         self.refresh(kinds)
 
     def refresh(self, kinds: Sequence[str] | None = None) -> None:
-        """Reset the simulator, and follow changes of its scenes, targets and initial states.
+        """Reset the simulator, and update after changes of its scenes, targets and initial states.
 
         Args:
             kinds: Texts that are equal for equal environments; default: all may differ.
@@ -294,7 +294,7 @@ class Problem:
         }
 
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
-        """Return the measures of the episodes of actions as :meth:`rollout`, without an error for divergence.
+        """Return the measures of episodes, simulated as in :meth:`rollout`, without an error for divergence.
         CUDA tensors stay on the device, except failures."""
         result = self.simulator.rollout(actions, gradient=gradient, strict=False)
         terms, iou = result.step_terms, result.step_iou[:, -1]

@@ -44,7 +44,7 @@ def show_progress(
         total: Total number of steps, including earlier ones; None: show only the title, on a terminal.
         enabled: Whether to show anything.
         plain_every: Steps between lines without a terminal.
-        compiling: Watcher of kernel compilation, shown on a terminal; None: none are.
+        compiling: Watcher of kernel compilation, shown on a terminal; None: kernels are not shown.
 
     Yields:
         Function to call after every step.

@@ -59,7 +59,7 @@ class UncheckedScene(Scene):
 
     @property
     def stable_dt(self) -> float:
-        """No limit."""
+        """No limit on the time step."""
         return math.inf
 
 

@@ -91,7 +91,7 @@ def stress(simulator: Simulator, actions: np.ndarray) -> Iterator[dict[str, Any]
     """Simulate actions, shape [batch, T, A], forwards and backwards.
 
     Yields:
-        Of each environment: outcome (``survived`` or the failure), speed of the fastest particle [cells per
+        For each environment: outcome (``survived`` or the failure), speed of the fastest particle [cells per
         substep], largest gradient component, the environment step of that component, and ``norms`` of the
         gradient with respect to each step's actions, shape [T].
     """

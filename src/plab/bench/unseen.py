@@ -1,4 +1,4 @@
-"""Scores of policies in scenes that they have not seen: ``variant=random`` of their task."""
+"""Scores of policies in unseen scenes: ``variant=random`` of their task."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Policy = Callable[[Any], np.ndarray]
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
 
 FIRST = 10_000
-"""``seed_scene`` of the first scene: beyond those of trainings (:mod:`plab.runners.shac`) and of submissions
+"""``seed_scene`` of the first scene, above those of training (:mod:`plab.runners.shac`) and of submissions
 (:mod:`plab.submissions.schema`)."""
 
 
@@ -53,7 +53,7 @@ def rows(
     observe: str | Sequence[str],
 ) -> Iterator[dict[str, object]]:
     """Measure policies, given by name with overrides of their configurations and training scenes, in
-    ``count`` scenes, ``together`` at a time. ``words`` are further overrides."""
+    ``count`` scenes, ``together`` at a time. ``words`` are additional overrides."""
     # Imported here, because SciPy would slow down every `--help`.
     from scipy import stats
 
@@ -91,15 +91,15 @@ def _trained(path: Path) -> tuple[Policy, Sequence[str], str]:
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Score policies in scenes that they have not seen, variant=random of their task.
+    """Score policies in unseen scenes, variant=random of their task.
 
-    plab bench unseen RESULT ...                       policies that runs have trained
+    plab bench unseen RESULT ...                       policies trained by runs
     plab bench unseen --policy MODULE:NAME task=TASK   a function of your own: actions, shape [scene, action],
                                                        for observations, shape [scene, entry], or by key
 
     A row has the mean score in the hard contact model with its 95 % interval (Student's t), the median, and
-    the share of scenes with at least 0.9. Words change the configuration; a run's policy has the observation
-    and the simulation that it was trained with. Scenes that do not fit a coarse grid are left out.
+    the share of scenes with at least 0.9. Overrides change the configuration; the policy of a run keeps the
+    observation and the simulation of its training. Scenes that do not fit a coarse grid are left out.
 
     EXAMPLES
       plab bench unseen results/Move-vrandom9000/pods/seed0-12ab34cd.h5 --csv unseen.csv

@@ -95,7 +95,7 @@ class Parser(ArgumentParser):
     """The parser of a command, with a docstring as help; errors raise ArgumentError."""
 
     def __init__(self, name: str, text: str | None, **options: Any) -> None:
-        """Make a parser without arguments of a command's name and docstring: purpose, then examples."""
+        """Create a parser without arguments from a command's name and docstring: purpose, then examples."""
         purpose, _, more = inspect.cleandoc(text or "").partition("\n\n")
         formed = RawDescriptionHelpFormatter
         super().__init__(name, description=purpose, epilog=more, formatter_class=formed, **options)
@@ -154,7 +154,7 @@ def sources_and_words(
 
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
-    """Return the finished runs that words choose, all of one protocol; raise ResultsError if there are
+    """Return the finished runs that match selections, all of one protocol; raise ResultsError if there are
     none."""
     from plab.results.schema import NAMES, ResultsError
     from plab.results.table import rows

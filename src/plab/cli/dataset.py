@@ -52,9 +52,10 @@ def main(argv: Sequence[str]) -> None:
     plab dataset KEY=VALUE ... method=NAME      actions that a method finds; its runs go to results_dir
     plab dataset RESULTS ... [KEY=VALUE ...]    the best actions of runs
 
-    Words are those of plab run -m. RESULTS are folders, files, archives or a name such as example; words then
-    choose among their runs, but for sim.device, sim.memory_mb, observe_particles and observe_target. The
-    actions are replayed in the hard contact model; set MINARI_DATASETS_PATH=datasets for minari.load_dataset.
+    Overrides are those of plab run -m. RESULTS are folders, files, archives or a name such as example;
+    overrides then select among their runs, except sim.device, sim.memory_mb, observe_particles and
+    observe_target. The actions are replayed in the hard contact model; set MINARI_DATASETS_PATH=datasets for
+    minari.load_dataset.
 
     EXAMPLES
       plab dataset task=Move
@@ -205,7 +206,7 @@ class _Recorder:
         self.spaces = seen, actions
 
     def play(self) -> Iterator[Episode]:
-        """Yield the episodes, without diverged ones."""
+        """Yield the episodes that do not diverge."""
         size = self._batch.size
         for first in range(0, len(self._all), size):
             part = self._all[first : first + size]

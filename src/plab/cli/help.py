@@ -58,8 +58,8 @@ _WIDTH = 100
 
 
 def help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help``, two screens: usage, flags, the names of all choices, those of the user's
-    own files in ``config_dir`` included, keys used often."""
+    """Return the text of ``--help``, two screens: usage, flags, names of all choices, including the user's
+    files in ``config_dir``, and frequent keys."""
     parts = [_USAGE, _FLAGS, "CHOICES"]
     for group in (*GROUPS, EXPERIMENT):
         start = f"  {'+' if group == EXPERIMENT else ''}{group}="

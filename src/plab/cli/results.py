@@ -1,10 +1,10 @@
 """Show, query, check, pack and unpack result files.
 
 plab results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
-plab results sql "select ..." [results ...]         any question to the tables of docs/results.md
+plab results sql "select ..." [results ...]         queries of the tables of docs/results.md
 plab results check [results ...]                    check every file against the schema
 plab results pack results --output runs.plab.zip.xz    put finished runs into one small file
-plab results unpack runs.plab.zip.xz --output folder   make files of them again
+plab results unpack runs.plab.zip.xz --output folder   restore the files of an archive
 """
 
 from __future__ import annotations

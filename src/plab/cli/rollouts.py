@@ -39,7 +39,7 @@ def render(argv: Sequence[str]) -> None:
     plab render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
     plab render KEY=VALUE ... [--output FILE]
 
-    Of folders and archives it takes the run with the highest score. The suffix of FILE selects the output:
+    For folders and archives, it shows the run with the highest score. The suffix of FILE selects the output:
       .png         start, target and the rollout's end, side by side
       .gif, .mp4   the rollout, with the target's ghost in it
 
@@ -75,7 +75,7 @@ def view(argv: Sequence[str]) -> None:
     plab view --gallery [KEY=VALUE ...] [--output FOLDER]     a page of every task, and index.html
 
     It plays in any browser: plasticine, manipulators, and the target as a ghost. Space plays and pauses,
-    arrow keys go by one step.
+    arrow keys move by one step.
 
     EXAMPLES
       plab view results/Rope-v1/adam/seed0-12ab34cd.h5

@@ -88,14 +88,14 @@ def load_config(
     Args:
         overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
         config_dir: Folder with the user's files, in subfolders named like the groups.
-        alone: Whether there is no other run, on which an override about another variant, task or profile
-            could have its effect.
+        alone: Whether overrides for another variant, task or profile are errors, because there is no other
+            run that uses them.
 
     Returns:
         The checked configuration.
 
     Raises:
-        ConfigError: If an override or a file does not fit.
+        ConfigError: If an override or a file is invalid.
     """
     words = prepared(overrides)
     check_overrides(words, config_dir)
@@ -108,7 +108,7 @@ _KEPT: dict[tuple[Any, ...], bytes] = {}
 
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
     """Return Hydra's composition of prepared overrides, without its own section; raise ConfigError if an
-    override or a file does not fit.
+    override or a file is invalid.
 
     Hydra takes a tenth of a second. Configurations that differ only in values are composed once, and the
     values are set afterwards, as Hydra does.

@@ -19,7 +19,7 @@ RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
 
 SOLVED = 1.0
-"""The highest score there is."""
+"""Highest possible score."""
 
 Kind = TypeVar("Kind")
 

@@ -28,8 +28,8 @@ _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IG
 
 
 def prepared(words: Sequence[str]) -> list[str]:
-    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``; raise
-    ConfigError for a text in place of a list."""
+    """Return overrides in the form that Hydra reads: names of folders and files quoted, ``.inf`` as ``inf``;
+    raise ConfigError for a text in place of a list."""
     if isinstance(words, str):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
     return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in words]
@@ -68,8 +68,8 @@ def _parsed(word: str) -> Override:
 
 
 def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
-    """Return the values that an override gives, as texts, such as ``seed=0,1`` or ``task=glob(R*)`` out of
-    ``names``; raise ConfigError if it gives none."""
+    """Return the values of an override, such as ``seed=0,1`` or ``task=glob(R*)``, as texts; globs select
+    from ``names``. Raise ConfigError if there are no values."""
     value = override.value()
     if isinstance(value, IntervalSweep):
         raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")

@@ -1,7 +1,7 @@
-"""Numbers of a task that are drawn: those of ``variant=random``, and those of every episode.
+"""Random parameters of a task: those of ``variant=random``, and those of every episode.
 
-``variant=random`` draws once, from the ranges in the task's section ``random``; samples depend only on the
-task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
+``variant=random`` is sampled once, from the ranges in the task's section ``random``; samples depend only on
+the task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
 
 The section ``randomize``, from which every episode is sampled, has the structure of the task, like variants,
 with a range ``[low, high]`` in place of each number or list of numbers: ``{yield_stress: [50, 200], gravity:
@@ -80,7 +80,7 @@ def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
 
 
 def present_value(task: TaskConfig, key: str, path: str) -> Any:
-    """Return the value of a sampled key in the task itself; raise ConfigError, with a message that begins
+    """Return the value of a key in the task before sampling; raise ConfigError, with a message that begins
     with ``path``, if the key cannot be randomised."""
     group, *rest = key.split(".")
     if key in (NOISE, SCENE):
@@ -106,7 +106,7 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
 
 
 def _entries(node: Any) -> dict[str, Any]:
-    """Return the values of a part of a task by key, which can be set."""
+    """Return a mutable view of the values of a part of a task, by key."""
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 

@@ -129,8 +129,8 @@ def _described(space: Space[Any]) -> dict[str, Any]:
 
 
 def metadata_of(path: str | Path) -> dict[str, Any]:
-    """Return the metadata of a dataset, a folder with the folder ``data`` or that folder itself, or
-    ``example``; with ``path``, the folder of its files. Raise DatasetError if there is none."""
+    """Return the metadata of a dataset, and the folder of its files as ``path``. The dataset is given by its
+    folder, by the subfolder ``data``, or as ``example``. Raise DatasetError if there is none."""
     path = EXAMPLE if str(path) == "example" else Path(path).expanduser()
     for place in (path / "data", path):
         if (file := place / "metadata.json").is_file():

@@ -22,8 +22,8 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
     """
 
     def __init__(self, env: gymnasium.Env[Any, np.ndarray]) -> None:
-        """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``; raise ValueError if
-        not."""
+        """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``; raise ValueError for
+        other observations."""
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):

@@ -154,7 +154,7 @@ class Sensors:
             observe: One of :data:`OBSERVATIONS`, or several.
             cameras: Cameras by name, or their attributes; default: :data:`DEFAULT_CAMERAS` if pictures are
                 observed.
-            simulator: Whose state is observed.
+            simulator: Simulator whose state is observed.
             state_space: Space of ``state``.
             points: Number of ``points``.
 
@@ -204,17 +204,17 @@ class Sensors:
         self.space = next(iter(spaces.values())) if self._alone else Dict(spaces)
 
     def release(self) -> None:
-        """Let go of the simulator and its memory."""
+        """Release the simulator and its memory."""
         self._sources, self._cameras = dict.fromkeys({"state"} & self._sources.keys()), {}
 
     def refresh(self) -> None:
-        """Follow a change of the simulator's scenes."""
+        """Update after a change of the simulator's scenes."""
         for sensor in self._cameras.values():
             sensor.refresh()
 
     def __call__(self, state: Callable[[], Array], like: Array) -> Any:
-        """Return observations of the current states; ``state`` is the function for the observation of this
-        name. CUDA tensors if ``like`` is one."""
+        """Return observations of the current states; ``state`` is a function that returns the observation of
+        this name. CUDA tensors if ``like`` is one."""
         out = {
             name: state() if source is None else _single(source(like))
             for name, source in self._sources.items()

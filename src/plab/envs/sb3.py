@@ -77,9 +77,9 @@ class PlabVecEnv(VecEnv):
         self.metadata = dict(METADATA)
 
     def reset(self) -> Any:
-        """Start the episodes; observations, shape [env, entry], float32, or by key. Their infos are in
-        ``reset_infos``. ``seed`` and ``set_options`` are those of :meth:`plab.envs.single.PlabEnv.reset`;
-        options are the same for all sub-environments."""
+        """Start the episodes, and return observations, shape [env, entry], float32, or by key. Their infos
+        are in ``reset_infos``. ``seed`` and ``set_options`` are those of
+        :meth:`plab.envs.single.PlabEnv.reset`; options are the same for all sub-environments."""
         if any(options != self._options[0] for options in self._options):
             raise ArgumentError("options differ between sub-environments: give one value for each")
         seeds = [seed for seed in self._seeds if seed is not None] or None
@@ -91,7 +91,7 @@ class PlabVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions of the next step, shape [env, action]."""
+        """Store the actions of the next step, shape [env, action]."""
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -129,7 +129,7 @@ class PlabVecEnv(VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all sub-environments; raise ValueError if for some only."""
+        """Set an attribute of all sub-environments; raise ValueError if only some are selected."""
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
         setattr(self, attr_name, value)

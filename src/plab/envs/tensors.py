@@ -28,7 +28,7 @@ class TensorEnv:
 
     Attributes:
         batch: The environments, with spaces, horizon and problem.
-        device: Where the tensors are.
+        device: Device of the tensors.
     """
 
     def __init__(self, batch: EpisodeBatch) -> None:

@@ -26,7 +26,7 @@ def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
 
     Writes ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd``, with the
     numbers of bodies and manipulators, and ``target.vtp``. The rollout must have motion; frames are ``every``
-    some environment steps.
+    environment steps apart.
     """
     scene = recording.scene
     series: dict[str, dict[float, str]] = {}

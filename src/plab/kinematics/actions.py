@@ -112,8 +112,8 @@ class JointActions:
         return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
 
     def frames(self, joints: Tensor) -> Tensor:
-        """Transforms from the links' frames to the world by joint positions, shape [T, batch, joint]; shape
-        [T, batch, link, 4, 4]."""
+        """Transforms from the links' frames to the world, shape [T, batch, link, 4, 4], for joint positions,
+        shape [T, batch, joint]."""
         c = self._on(joints.device)
         positions = joints.index_select(-1, c["order"])[..., None, None]
         angle = positions * c["hinge"][..., None, None]
@@ -147,7 +147,7 @@ class JointActions:
 
 
 def rotation_vector(turn: Tensor) -> Tensor:
-    """Logarithm of rotation matrices, shape [..., 3, 3], by less than half a turn; shape [..., 3]."""
+    """Logarithm, shape [..., 3], of rotation matrices, shape [..., 3, 3], with angles below pi."""
     skew = 0.5 * (turn - turn.transpose(-1, -2))
     axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
     square = axis[..., 0] ** 2 + axis[..., 1] ** 2 + axis[..., 2] ** 2

@@ -122,7 +122,8 @@ class Chain:
         return joints, tuple((link.parent, link.shape) for link in self.links)
 
     def frames(self, positions: Sequence[float]) -> np.ndarray:
-        """Transforms from the links' frames to the world by joint positions [joint], shape [link, 4, 4]."""
+        """Transforms from the links' frames to the world, shape [link, 4, 4], for joint positions, shape
+        [joint]."""
         world: list[np.ndarray] = []
         for joint, position in zip(self.joints, positions, strict=True):
             above = world[joint.parent] if joint.parent >= 0 else np.eye(4)

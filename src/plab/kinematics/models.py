@@ -131,8 +131,8 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
 
 
 def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None, Any, np.ndarray]:
-    """Shape, its lengths, and the transform from its frame to the geom's, of a type of MuJoCo's, its lengths
-    [3], and its bounding box: centre and half edges [6]."""
+    """Return a link's shape, its lengths, and the transform from its frame to the geom's, given the geom's
+    MuJoCo type, its lengths [3], and its bounding box: centre and half edges [6]."""
     radius, half = lengths[:2]
     upright = pose_matrix((0.0, 0.0, 0.0), _ALONG[2])
     if kind == "SPHERE":

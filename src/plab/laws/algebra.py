@@ -33,7 +33,7 @@ def entry(a, b, i, j):
 
 
 def total(terms):
-    """Their sum, from the first on."""
+    """Sum of the terms, in their order."""
     return reduce(operator.add, terms)
 
 

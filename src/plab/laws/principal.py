@@ -3,7 +3,7 @@ directions.
 
 Jacobi's method with a fixed number of sweeps and no branches. The derivative is that of an isotropic tensor
 function: eigenvalues in fixed directions, and rotations of the directions by divided differences, with their
-    limits for equal eigenvalues. Nothing is clamped.
+limits for equal eigenvalues. No value is clamped.
 """
 
 import numpy as np

@@ -39,7 +39,7 @@ class Chamfer(ParticleTerm):
         self.found = ti.field(sim.real, shape=shape)
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Choose the points."""
+        """Compute the points of the targets."""
         made = {own.tobytes(): own for own in mass}
         points = {key: mass_portions(own, POINTS) for key, own in made.items()}
         self.sim.write(self.points, np.stack([points[own.tobytes()] for own in mass]))
@@ -58,7 +58,7 @@ class Chamfer(ParticleTerm):
 
     @ti.func
     def finish(self, e):
-        """The points' share."""
+        """Return the contribution of the points."""
         total = ti.cast(0.0, ti.f64)
         for k in range(POINTS):
             total += ti.cast(self.nearest[e, k], ti.f64)
@@ -68,7 +68,8 @@ class Chamfer(ParticleTerm):
 
     @ti.func
     def gradient(self, e, x, v):
-        """Towards the nearest point, and those to which the particle is the nearest."""
+        """Derivative of the distances to the nearest point, and to the points whose nearest particle this
+        is."""
         least = ti.cast(FAR, self.sim.real)
         way = 0.0 * x
         x_bar = 0.0 * x

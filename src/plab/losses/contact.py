@@ -1,9 +1,9 @@
 """Contact terms: three functions of the distances d_p between a moving manipulator and all particles p.
 
 * ``nearest``: ``D^2``, D the distance of the nearest particle, and its gradient.
-* ``all``: the same measure; as gradient ``2 D sum grad d_p`` over all particles outside. It is not the
-gradient of any function. * ``soft``: ``D^2``, D the mean of the d_p with weights ``1 / (1 + 1e4 d_p^2)``, and
-its gradient.
+* ``all``: the same measure, with ``2 D sum grad d_p`` over all particles outside as gradient, which is not
+  the gradient of any function.
+* ``soft``: ``D^2``, D the mean of the d_p with weights ``1 / (1 + 1e4 d_p^2)``, and its gradient.
 
 Distances are 0 inside a manipulator. Each term is summed over the moving manipulators.
 """
@@ -36,7 +36,7 @@ class NearestContact(DistanceTerm):
 
     @ti.func
     def add(self, tally, d, particle):
-        """The nearer one."""
+        """Keep the nearer particle."""
         out = tally
         if ti.cast(d, ti.f64) < tally[0]:
             out = ti.Vector([ti.cast(d, ti.f64), ti.cast(particle, ti.f64)])
@@ -44,7 +44,7 @@ class NearestContact(DistanceTerm):
 
     @ti.func
     def join(self, tally, other):
-        """The nearer one."""
+        """Keep the nearer particle."""
         out = tally
         if other[0] < tally[0] or (other[0] == tally[0] and other[1] < tally[1]):
             out = other

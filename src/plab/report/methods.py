@@ -19,8 +19,8 @@ class Method:
         kind: :data:`~plab.config.families.RL` or :data:`~plab.config.families.GRADIENT`; empty for a method
             that is not plab's.
         colour: Colour of its curves.
-        dashes: Line style, for those who do not see the colour.
-        of: Method of which these are some of the runs, empty for all: see :func:`part`.
+        dashes: Line style, for readers who cannot distinguish colours.
+        of: Method that the runs are a part of, see :func:`part`; empty for a whole method.
     """
 
     name: str

@@ -53,7 +53,7 @@ class Page:
         Args:
             runs: Our runs.
             out: Folder to write to.
-            command: Command that makes the page.
+            command: Command that generates the page.
         """
         self.shown, self._out = best_runs(runs), out
         by_task, by_configuration = (

@@ -1,9 +1,9 @@
 """Statistics of scores: means, confidence intervals, curves and equal budgets, and aggregates over a suite by
 stratified bootstrap.
 
-Interquartile mean and probability of improvement as in Agarwal et al., Deep
-Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021). Strata are configurations;
-bootstrap samples have the same number of runs per configuration.
+Interquartile mean and probability of improvement are those of Agarwal et al., Deep Reinforcement Learning at
+the Edge of the Statistical Precipice (NeurIPS 2021). Strata are configurations; bootstrap samples have the
+same number of runs per configuration.
 """
 
 from __future__ import annotations
@@ -251,13 +251,13 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
 
 
 def load_rows(path: str | Path) -> Rows:
-    """Return the iterations of one run, as :func:`load_series`."""
+    """Return the iterations of one run, with the columns of :func:`load_series`."""
     run = read(path)
     return rows_on_axes(run.config, run.columns)
 
 
 def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
-    """Return the iterations of a loaded run, as :func:`load_series`."""
+    """Return the iterations of a loaded run, with the columns of :func:`load_series`."""
     rows = {name: np.asarray(values) for name, values in iterations.items()}
     sim, known = config["sim"], known_family(config["method"]["family"])
     simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
@@ -288,7 +288,7 @@ def band(
         axis: One of :data:`AXES`.
         column: Column of the values.
         floor: Lower bound of the values of each run, as in the paper's figures; None keeps them.
-        points: Most points of the band.
+        points: Maximum number of points of the band.
 
     Returns:
         The band at the union of the runs' points, with linear interpolation; None without runs.

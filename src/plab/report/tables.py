@@ -52,7 +52,7 @@ class Table:
         title: Heading.
         cells: Text of the table.
         data: CSV rows with all digits, one per number or group of numbers.
-        bold: Mask of bold cells, of the shape of ``cells``; None if none is.
+        bold: Mask of bold cells, of the shape of ``cells``; None without bold cells.
         notes: Notes on the contents and the provenance of the table.
         long: Whether it may be longer than a page.
     """
@@ -262,7 +262,8 @@ def _numbers(summary: Summary) -> dict[str, float]:
 
 
 def _best(line: pd.DataFrame) -> list[bool]:
-    """Return the mask of the best methods per kind, as printed; none if a cell is incomplete."""
+    """Return the mask of the best methods per kind, compared as printed; no method if a cell is
+    incomplete."""
     best = pd.Series(False, line["method"])
     scores = line.set_index("method")
     for kind in (RL, GRADIENT):

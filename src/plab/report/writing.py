@@ -39,7 +39,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     Args:
         runs: Our runs.
         out: Folder to write to.
-        command: Command that makes them.
+        command: Command that generates them.
         benchmark: Table of ``plab bench speed --paper --csv``, or None.
 
     Returns:
@@ -69,12 +69,12 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
 
 
 def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
-    """Draw all figures with data, and write them as PDF and PNG; and their notes and origin.
+    """Draw all figures with data, and write them as PDF and PNG, with their notes and origin.
 
     Args:
         runs: Our runs.
         out: Folder to write to.
-        command: Command that makes them.
+        command: Command that generates them.
 
     Returns:
         The figures.

@@ -3,7 +3,8 @@
 The layout is described in docs/developers/format.md. A run in progress stores its state in
 ``<name>.partial.h5``, which is replaced atomically at intervals: after a kill, the previous version remains,
 from which the same command resumes. Finished runs can be packed into archives, which load like folders. This
-package does not import torch or Taichi, and what reads many results on demand, so that runs start fast.
+package does not import torch or Taichi, and imports the modules that read many results on demand, so that
+runs start fast.
 """
 
 from __future__ import annotations

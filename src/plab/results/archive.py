@@ -41,8 +41,8 @@ def pack(
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
         chosen: Selection of runs; None: all.
-        digits: Least number of significant digits of the iterations, >= 1; None: all. four reduce the size by
-            two thirds. Actions and the final evaluation keep all digits.
+        digits: Least number of significant digits of the iterations, >= 1; None: all. Four digits reduce the
+            size by two thirds. Actions and the final evaluation keep all digits.
 
     Returns:
         Number of runs in the archive, and the errors of unreadable files, which are not in it.

@@ -54,21 +54,21 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
         compress: Compress the arrays (gzip) and flush to disk, for the final file.
 
     Raises:
-        ResultsError: If the file cannot be written; ``path`` is then as it was.
+        ResultsError: If the file cannot be written; ``path`` is then unchanged.
     """
     replace_file(path, encode(result, compress=compress), sync=compress)
 
 
 def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> None:
-    """Create or replace a file in one atomic step, and the folders that it is in.
+    """Create or replace a file atomically, and create its parent folders.
 
     Args:
         path: The file.
         content: Its content; text in UTF-8.
-        sync: Wait until the disk has it.
+        sync: Flush the file to disk.
 
     Raises:
-        ResultsError: If the file cannot be written; ``path`` is then as it was.
+        ResultsError: If the file cannot be written; ``path`` is then unchanged.
     """
     content = content.encode() if isinstance(content, str) else content
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")

@@ -1,9 +1,9 @@
 """A run in progress: file, checkpoints, resumption, lock and provenance.
 
 Locks are operating-system locks (``flock``, on Windows ``msvcrt``) of ``<run>.lock`` beside the run's files.
-It is released when its process ends, so leftover lock files are not locked. On network file systems with
-locks, such as NFS, Lustre (mounted with ``flock``) and GPFS, it is valid on all machines; without locks, no
-run is computed.
+A lock is released when its process ends, so leftover lock files are not locked. On network file systems with
+locks, such as NFS, Lustre (mounted with ``flock``) and GPFS, it is valid on all machines; on file systems
+without locks, no run is computed.
 """
 
 from __future__ import annotations

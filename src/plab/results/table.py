@@ -53,7 +53,7 @@ T = TypeVar("T")
 _ORIGIN = {"started": "start_time"} | {
     name: name for name in ("device", "precision", "batch", "plab", "git_commit")
 }
-"""Column to key of the provenance."""
+"""Keys of the provenance by column."""
 
 _BEST = ("best_iteration", "best_loss")
 
@@ -61,7 +61,7 @@ COLUMNS = (
     *("task", "variant", "method", "seed", "status", "message", "score", "iou", "loss", "iterations"),
     *(*_BEST, "seconds", *_ORIGIN, "config_hash", "path"),
 )
-"""Columns that every table of runs has."""
+"""Columns of every table of runs."""
 
 _INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
 
@@ -128,7 +128,7 @@ def load(
 
 
 def warn_of(unreadable: Sequence[ResultsError]) -> None:
-    """Name unreadable files in one warning, attributed to the caller's caller."""
+    """Warn once about all unreadable files; the warning is attributed to the caller's caller."""
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)
         warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)

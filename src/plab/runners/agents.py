@@ -307,8 +307,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 def mlp(x: Tensor, part: Part, name: str, activation: Callable[[Tensor], Tensor], *, last: bool) -> Tensor:
-    """Evaluate stacked ``nn.Sequential`` of linear layers, named ``name`` in the part or the part itself,
-    for x of shape [stack, row, in]; an activation is after each, but the last if ``last``."""
+    """Evaluate a stacked ``nn.Sequential`` of linear layers for x of shape [stack, row, in]. ``name`` is its
+    name in the part, empty if it is the part itself. Each layer is followed by an activation, except the last
+    one if ``last``."""
     prefix = f"{name}." if name else ""
     numbers = [int(n[len(prefix) : -len(".weight")]) for n in part if n.startswith(prefix) and "weight" in n]
     for number in sorted(numbers):
@@ -522,7 +523,7 @@ class Agents:
         self.draws.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
-        """Return each agent's means over the updates since the last call, by :attr:`LOSSES`."""
+        """Return each agent's losses by name, means over the updates since the last call."""
         means = {name: torch.stack(rows).mean(0).tolist() for name, rows in self._losses.items()}
         self._losses = {}
         return [{name: row[agent] for name, row in means.items()} for agent in range(self.count)]
@@ -571,7 +572,7 @@ class OffPolicyAgents(Agents):
         return self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
 
     def numbers(self) -> Tensor:
-        """Draw the numbers of an update's transitions, shape [agent, row]."""
+        """Draw the indices of an update's transitions, shape [agent, row]."""
         return self.draws.block("numbers", "integers", self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class ContactStarts:
     """Starts for a scene and its target."""
 
     def __init__(self, scene: Scene, target: np.ndarray) -> None:
-        """Keep the scene and the target's mass tensor, shape [n, n, n]."""
+        """Store the scene and the target's mass tensor, shape [n, n, n]."""
         self._scene, self._target = scene, target
         self._tools = [m for m in scene.tools if m.action_dim]
 

@@ -73,7 +73,7 @@ class IdentifyRunner(Runner):
     """
 
     def build(self) -> None:
-        """Read the episode, and make an environment per change of a parameter."""
+        """Read the episode, and create an environment per perturbed parameter."""
         from plab.demonstrations.minari import read_episodes
 
         (track,), method = self.tracks, self.method
@@ -147,7 +147,7 @@ class IdentifyRunner(Runner):
         return super().judge(np.concatenate([actions] * self.problem.simulator.batch))
 
     def summary_line(self, means: Mapping[str, float], tracks: Any) -> str:
-        """Return the fit."""
+        """Return the misfit, and the parameters with their standard deviations."""
         fit = (f"{n} {means[n]:.4g} ± {means[f'{n}_deviation']:.2g}" for n in self.method.parameters)
         return f"misfit {means['misfit']:.3g}, {', '.join(fit)}"
 

@@ -42,8 +42,8 @@ class MpcConfig(MethodConfig):
     """Model-predictive control.
 
     Attributes:
-        window: Steps that a plan looks ahead; less at the end of the episode.
-        execute: Steps taken of each plan.
+        window: Length of a plan [environment steps]; shorter at the end of the episode.
+        execute: Number of steps of each plan that are executed.
         planner: Section ``method`` of a planner or gradient method; its iterations are those of each plan.
     """
 
@@ -104,7 +104,7 @@ class MpcRunner(PlannerRunner):
     """
 
     def build(self) -> None:
-        """Make the problem, with an environment per candidate."""
+        """Build the problem, with an environment per candidate."""
         super().build()
         self._beginning = self._current_state()
 

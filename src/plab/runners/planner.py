@@ -66,7 +66,7 @@ class Request:
     Attributes:
         actions: Actions in [-1, 1], shape [P, T, A].
         softness: Decay rate of the soft contact [1 / domain unit]; None: the hard one.
-        gradient: Ask for their gradient.
+        gradient: Request their gradient.
     """
 
     actions: Tensor
@@ -114,7 +114,7 @@ class CandidateStart:
     """
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
-        """Keep scene and target, a mass tensor of shape [n, n, n]."""
+        """Store the scene and the target, a mass tensor of shape [n, n, n]."""
         from plab.runners.contact_starts import ContactStarts
 
         self.shape, self.device = (scene.horizon, scene.action_dim), device
@@ -135,7 +135,7 @@ class Planner(ABC):
     """A run's search; subclasses define its start and an iteration.
 
     Attributes:
-        method: Its numbers.
+        method: Its section ``method``.
         start: Source of the first candidates.
         memory: Tensors that the next iteration depends on.
         iteration: Number of the next iteration.
@@ -148,7 +148,7 @@ class Planner(ABC):
 
     @abstractmethod
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Make the first candidates, given those of the previous stage, best first, shape [N, T, A]; N is 0
+        """Create the first candidates, given those of the previous stage, best first, shape [N, T, A]; N is 0
         in the first stage."""
 
     @abstractmethod
@@ -187,7 +187,7 @@ class Planner(ABC):
         return {"iteration": self.iteration, "memory": arrays}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
+        """Restore a state returned by :meth:`state`."""
         self.iteration = int(state["iteration"])
         arrays = state.get("memory", {}).items()
         self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
@@ -282,7 +282,7 @@ class PlannerRunner(Runner):
         self._planners: dict[int, Any] = {}
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the run's planner, or restore it from the file."""
+        """Create the run's planner, or restore it from the file."""
         number, problem = track.number, self.problem
         start = CandidateStart(problem.scenes[number], problem.target_mass[number], self._device)
         planner = self._planners[number] = make_planner(track.cfg.method, start)

@@ -41,7 +41,7 @@ CLIP = 10.0
 """Largest observation and reward, in units of their running standard deviations."""
 
 EPSILON = 1e-8
-"""Added to variances of observations, as Stable-Baselines3 does."""
+"""Added to variances of observations, as in Stable-Baselines3."""
 
 Moments: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Means and variances of observations, shape [entry] each, by which they are scaled."""

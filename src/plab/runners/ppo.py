@@ -235,8 +235,8 @@ class PpoAgents(Agents):
         table["returns"].copy_(table["advantages"] + values)
 
     def minibatch(self, numbers: Tensor) -> Tensor:
-        """Update from some transitions of the rollout, shape [agent, row], numbered by environment, then
-        step; return the losses of policy, value and entropy, shape [3, agent]."""
+        """Update from a minibatch of the rollout: indices of transitions, by environment, then step, shape
+        [agent, row]; return the losses of policy, value and entropy, shape [3, agent]."""
         m = self.method
         where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
         observations, actions = (

@@ -267,8 +267,8 @@ class Runner:
     report: Report
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-        """Take over some runs, as alike as :func:`plab.sweep.running.plan` asks for, with a text before their
-        progress; nothing is built yet."""
+        """Store the runs, a batch of :func:`plab.sweep.running.plan`, and a text shown before their progress;
+        nothing is built yet."""
         self.tracks = list(tracks)
         for number, track in enumerate(tracks):
             track.number = number
@@ -335,7 +335,7 @@ class Runner:
 
     @property
     def method(self) -> Any:
-        """The section ``method`` of the first run, which those that train in step have in common."""
+        """Section ``method`` of the first run, shared by runs that train in lockstep."""
         return self.tracks[0].cfg.method
 
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
@@ -561,7 +561,7 @@ class RunLog:
     """
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
-        """Keep the run's configuration and file."""
+        """Store the run's configuration and file."""
         self._cfg, self._run = cfg, run
         self.wanted = cfg.logger != "none"
         self._write: Callable[[Mapping[str, float], int], object] | None = None
@@ -604,8 +604,8 @@ class RunLog:
         return write, writer.close
 
     def _wandb(self, _steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
-        """Begin a run at Weights & Biases, or go on with that of the same configuration; its own files are in
-        the folder ``wandb`` of ``results_dir``, and ``WANDB_MODE`` and wandb's other variables apply."""
+        """Start a run at Weights & Biases, or resume that of the same configuration. Its files are in the
+        folder ``wandb`` of ``results_dir``; ``WANDB_MODE`` and wandb's other environment variables apply."""
         import wandb
 
         cfg = self._cfg

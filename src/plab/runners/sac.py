@@ -87,9 +87,10 @@ class SacAgents(OffPolicyAgents):
         self._note(self._captured(self.descent, numbers, *noise))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
-        """Update entropy coefficient, critics, actor and targets from some transitions, see
-        :meth:`plab.runners.agents.ReplayBuffer.sample`, with standard normal noise of the actions
-        and of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
+        """Update entropy coefficient, critics, actor and targets from sampled transitions. ``numbers`` are
+        the integers of :meth:`plab.runners.agents.ReplayBuffer.sample`; the noises of actions and next
+        actions are standard normal, shape [agent, row, action]. Return coefficient and losses, shape [4,
+        agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         own_actions, log_prob = self._drawn(observations, noise)

@@ -1,10 +1,10 @@
 """Search algorithms of the planners.
 
-* ``multistart``: gradient descent (Adam) from many starts; the worse half is replaced at intervals. *
-``cem``, the cross-entropy method: sample curves from a normal distribution, fit it to the best, repeat. *
-``mppi``, model-predictive path integral: the repeated mean of all curves, weighted by exp(-cost), over the
-whole episode; with a deterministic simulator, replanning during the episode would gain nothing. * ``cmaes``,
-covariance matrix adaptation of a curve's points, by the library cmaes.
+* ``multistart``: gradient descent (Adam) from many starts; the worse half is replaced at intervals.
+* ``cem``, cross-entropy method: sample curves from a normal distribution, fit it to the best, repeat.
+* ``mppi``, model-predictive path integral: the repeated mean of all curves, weighted by exp(-cost), over the
+  whole episode; with a deterministic simulator, replanning during the episode would gain nothing.
+* ``cmaes``: covariance matrix adaptation of a curve's points, by the library cmaes.
 
 The last three draw curves of actions and learn from their costs, without a gradient. To reproduce a result:
 
@@ -143,8 +143,8 @@ class SamplerConfig(PlannerConfig):
 
     Attributes:
         knots: Number of points in time that define the curve of actions, at most one per environment step.
-        curve: ``constant``: each point applies to its part of the episode; ``linear``: straight from one to
-            the next.
+        curve: ``constant``: each point applies to its part of the episode; ``linear``: linear interpolation
+            between points.
         spread: Standard deviation of the first samples around the best start, at each point.
     """
 

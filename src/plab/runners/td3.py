@@ -89,13 +89,14 @@ class Td3Agents(OffPolicyAgents):
         self._note(self._captured(update, numbers, noise))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update the critics from some transitions, see
-        :meth:`plab.runners.agents.ReplayBuffer.sample`, with standard normal noise of the target
-        policy, shape [agent, row, action]; losses of shape [1, agent]."""
+        """Update the critics from sampled transitions, and return their losses, shape [1, agent]. ``numbers``
+        are the integers of :meth:`plab.runners.agents.ReplayBuffer.sample`; the noise of the target policy is
+        standard normal, shape [agent, row, action]."""
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
     def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update critics, actor and targets; arguments as of :meth:`critics`, losses of shape [2, agent]."""
+        """Update critics, actor and targets, with the arguments of :meth:`critics`; return losses, shape [2,
+        agent]."""
         samples = self.replay.sample(numbers)
         critic_loss = self._update_critics(samples, noise)
         actions = self._actor("actor", samples.observations)

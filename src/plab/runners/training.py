@@ -164,7 +164,7 @@ class PolicyRunner(Runner, ABC):
     Attributes:
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
-        watched: Losses of the updates are requested.
+        watched: Whether losses of the updates are recorded.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
@@ -213,7 +213,7 @@ class PolicyRunner(Runner, ABC):
         belongs to other networks."""
 
     def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
-        """Return a policy's replay buffer and its number there, if it has one."""
+        """Return a policy's replay buffer and its index there, if it has one."""
         return None
 
     @abstractmethod
@@ -259,7 +259,7 @@ class PolicyRunner(Runner, ABC):
         self.prepare(*own or [judge])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Keep the initial policy, or restore policy and replay buffer from the file."""
+        """Store the initial policy, or restore policy and replay buffer from the file."""
         if state is None:
             return
         self.restore(track.number, state)
@@ -455,7 +455,7 @@ class ActorRunner(PolicyRunner):
         return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
 
     def note(self, **values: torch.Tensor | np.ndarray) -> None:
-        """Keep values of a round's episodes, shape [env], until :meth:`take`."""
+        """Store values of a round's episodes, shape [env], until :meth:`take`."""
         for name, entries in values.items():
             self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
 
@@ -487,7 +487,7 @@ class ActorRunner(PolicyRunner):
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; raise RuntimeError if it belongs to other networks."""
+        """Restore a state returned by :meth:`state`; raise RuntimeError if it belongs to other networks."""
         for name, one in self.learners().items():
             one.load_state_dict(state[name])
         mean, var, count = state["statistics"]

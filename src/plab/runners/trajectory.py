@@ -1,8 +1,7 @@
 """Open-loop trajectory optimisation: sequences of actions, improved by the gradient through the simulator.
 
-The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. The runs of a batch share one
-simulator, an environment each, and nothing else: each gives the numbers that it gives alone. To reproduce a
-result:
+The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. Each run of a batch has its
+own environment in a shared simulator; its numbers do not depend on the other runs. To reproduce a result:
 
     python -m plab.run task=Rope variant=1 method=adam seed=0
 """
@@ -33,7 +32,7 @@ class TrajectoryConfig(MethodConfig):
         optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
         lr_by_task: Learning rates by ``protocol.numbers`` and task, or ``other``. Empty in a run's
-            configuration of a run; ``lr`` has the value.
+            configuration; ``lr`` has the value.
         contact_by_task: Weights of the contact term by term and task. Empty likewise; ``loss_weights`` has
             the value.
         betas: Decay rates of adam's two moment estimates.
@@ -69,7 +68,7 @@ class TrajectoryRunner(Runner):
     """
 
     def build(self) -> None:
-        """Make the problem, with an environment per run."""
+        """Build the problem, with an environment per run."""
         self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
         self._set_contact()
         self._rules: dict[int, UpdateRule] = {}
@@ -80,7 +79,7 @@ class TrajectoryRunner(Runner):
         self.problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Draw the first actions, or take those of the file."""
+        """Sample the initial actions, or load those of the file."""
         scene = self.problem.scenes[track.number]
         method = track.cfg.method_as(TrajectoryConfig)
         kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
@@ -92,7 +91,7 @@ class TrajectoryRunner(Runner):
             self._finalists[track.number] = Finalists.of(state["finalists"])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Run the actions of all, and improve those of each by their gradient."""
+        """Simulate the actions of all runs, and update those of each run by their gradient."""
         tried = self.actions_at_rest()
         for track in tracks:
             tried[track.number] = self._rules[track.number].actions
@@ -109,7 +108,7 @@ class TrajectoryRunner(Runner):
             row["gradient_norm"] = float(np.linalg.norm(gradient))
             new = Finalist(tried[number].copy(), track.iteration, row["loss"], row["score"])
             self._finalists[number].add(new)
-        # As the release has it, the last iteration counts, whatever is kept.
+        # The release scores the last iteration, whichever actions are kept.
         judging = [track for track in rows if track.cfg.protocol.score != "last"]
         ahead = {track: self.iterations(track) - track.iteration - 1 for track in judging}
         due = [t for t in judging if ahead[t] == 0 or (t.iteration + 1) % CHECK_INTERVAL == 0]
@@ -125,15 +124,15 @@ class TrajectoryRunner(Runner):
                 {"actions": rule.actions, "optimizer": dict(rule.state), "finalists": finalists.state()},
                 steps_forward=checks.get(track, 0) * len(rule.actions),
                 steps_gradient=len(rule.actions),
-                # Until the first check those of the lowest loss are kept.
+                # Before the first check, the actions of the lowest loss are kept.
                 whole=np.isnan(finalists.kept_score) or track not in judging,
                 best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
             )
             yield track, step
 
     def _check(self, tracks: Sequence[Track], ending: Sequence[Track]) -> dict[Track, int]:
-        """Score in the hard contact model the actions of highest score of some runs, and those of lowest loss
-        of ending ones; return the rollouts of each run."""
+        """Evaluate the finalists of some runs in the hard contact model: the actions of highest score and,
+        for runs that end, those of lowest loss. Return the rollouts of each run."""
         rollouts = dict.fromkeys(tracks, 0)
         for name, some in (("highest", tracks), ("lowest", ending)):
             chosen: dict[Track, Finalist] = {t: getattr(self._finalists[t.number], name) for t in some}
@@ -152,7 +151,7 @@ class TrajectoryRunner(Runner):
         return rollouts
 
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
-        """Return the loss, and the score of the actions that are kept; see :class:`Finalists`."""
+        """Return the loss, and the score of the kept actions; see :class:`Finalists`."""
         if all(track.cfg.protocol.score == "last" for track in tracks):
             return super().summary_line(means, tracks)
         kept = f" score of the best actions {means['kept_score']:.3f}" if means["kept_score"] >= 0.0 else ""
@@ -173,16 +172,16 @@ class Finalist:
 
 @dataclass
 class Finalists:
-    """Actions of a run that may be kept.
+    """Candidates for the best actions of a run.
 
-    Scores of rows are of their contact model. The actions of the highest since the last check are run in the
-    hard one, after the last iteration those of the lowest loss of the run, too; kept are those of the highest
-    score there, and of several the ones of lowest loss.
+    The score of a row is that of its contact model. A check evaluates the actions of the highest score since
+    the last check in the hard contact model; the last check also evaluates the actions of the lowest loss.
+    The actions with the highest score there are kept, with ties broken by loss.
 
     Attributes:
-        highest: Actions of the highest score since the last check, if there were any.
+        highest: Actions of the highest score since the last check; None without any.
         lowest: Actions of the lowest loss.
-        kept_score: Score of the actions that are kept, in the hard contact model; NaN before the first check.
+        kept_score: Score of the kept actions in the hard contact model; NaN before the first check.
         kept_loss: Their loss.
     """
 
@@ -220,12 +219,13 @@ class Finalists:
 
 
 class UpdateRule:
-    """The actions of an episode, and their change by a gradient.
+    """Actions of an episode, and the rule that updates them by a gradient.
 
-    In NumPy, not as ``torch.optim``: importing torch takes 1.5 s of CPU time before the first progress line.
+    NumPy instead of ``torch.optim``, because importing torch takes 1.5 s of CPU time before the first
+    progress line.
 
     Attributes:
-        method: Rates.
+        method: Section ``method``, with the rates.
         actions: Each in [-1, 1], shape [T, A], float64.
         state: State between updates by name: arrays of the actions' shape, or numbers.
     """

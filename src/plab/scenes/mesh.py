@@ -18,7 +18,7 @@ import numpy as np
 from plab.files import ShapeError, one_line, pinned
 
 MESHES = (".obj", ".stl", ".ply")
-"""Endings of mesh files."""
+"""Suffixes of mesh files."""
 
 _LEAST_SHARE = 1e-4
 """Least fraction of the bounding box filled by a solid, because points inside are found by rejection."""

@@ -158,7 +158,7 @@ class Body:
     """One body of plasticine, initially filled with uniformly sampled particles.
 
     Attributes are those of :class:`plab.config.BodyConfig`: ``shape``, ``center`` and ``size`` [domain
-    units], ``particles``, and its own material, of which parts that are None are the scene's.
+    units], ``particles``, and its material; parts that are None are those of the scene.
     """
 
     shape: str

@@ -1,4 +1,4 @@
-"""The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
+"""Simulator in Taichi, usable without Hydra, Gymnasium and torch."""
 
 # First: it changes the decorators of the kernels that the others define.
 import plab.sim.compiler  # noqa: F401

@@ -94,7 +94,7 @@ def material_keys(scene: Scene) -> tuple[str, ...]:
 
 
 def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tuple[Scene, ...]:
-    """Return the scenes with other material, not validated.
+    """Return the scenes with other material parameters, without validation.
 
     Args:
         scenes: One scene per environment.

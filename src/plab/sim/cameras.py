@@ -68,7 +68,7 @@ class CameraSensor:
         self.refresh()
 
     def refresh(self) -> None:
-        """Follow a change of the simulator's scenes."""
+        """Update after a change of the simulator's scenes."""
         scenes = self._simulator.scenes
         spacings = [[(b.volume / b.particles) ** (1 / 3) for b in scene.bodies] for scene in scenes]
         balls = [

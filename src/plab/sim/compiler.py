@@ -182,9 +182,9 @@ def place_fields() -> Any:
 
 
 def free_fields(handle: Any) -> None:
-    """Free fields that no kernel uses any more.
+    """Free fields that are not in use by any kernel.
 
-    ``SNodeTree.destroy`` would also have the kernels of all other simulators compiled anew.
+    ``SNodeTree.destroy`` would also cause the kernels of all other simulators to be recompiled.
     """
     handle.destroy_snode_tree(impl.get_runtime().prog)
 

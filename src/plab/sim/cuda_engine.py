@@ -33,7 +33,7 @@ RESERVED = 1024
 """Shared memory reserved by the device per block [bytes]."""
 
 MULTIPROCESSORS, SHARED_BYTES = 16, 81
-"""The driver's numbers for how many multiprocessors there are, and for the shared memory of each [bytes]."""
+"""Driver's attributes: number of multiprocessors, and shared memory of each [bytes]."""
 
 
 def device_attribute(number: int) -> int:

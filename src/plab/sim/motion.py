@@ -1,7 +1,7 @@
 """Rigid motion of the manipulators: poses, their frames of contact, and adjoints.
 
 A pose is 8 numbers: position (3), unit quaternion w, x, y, z (4), gap (1). One substep applies 1 / substeps
-of the motion that an environment step's action asks for. Adjoints are written by hand: they are a few
+of the motion of an environment step's action. Adjoints are written by hand, because they are only a few
 quaternion products. Everything here is float64 in both precisions; a manipulator is 8 numbers.
 """
 

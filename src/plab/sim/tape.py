@@ -138,8 +138,8 @@ class Tape:
         Args:
             actions: Actions of all steps.
             poses: History of the manipulators' poses; entry 0 is set.
-            terms: Measures after each step are written to it, from the second entry; None if
-                :meth:`backward`, which computes them anyway, is to do that.
+            terms: Measures after each step are written to it, from the second entry; None to leave this to
+                :meth:`backward`, which computes them in any case.
             steps: Environment steps T.
             length: Result of :meth:`plan`, or None to store nothing.
             after: Called after each step with its number, and array and time slot of the resulting state.
@@ -203,8 +203,8 @@ class Tape:
         """Backpropagate through the steps of :meth:`forward`.
 
         Args:
-            actions: Those of :meth:`forward`, as ``poses``.
-            poses: Likewise.
+            actions: Actions of :meth:`forward`.
+            poses: Pose history of :meth:`forward`.
             terms: Measures after each step are written to it, from the second entry.
             steps: Environment steps T.
             contact_free: Number of initial steps without contact, in which particle adjoints are not needed.
@@ -257,7 +257,7 @@ class RecordedStates:
     """
 
     def __init__(self, x: Any, v: Any, poses: Any, mass: Any, back: Callable[[dict[str, Any]], Any]) -> None:
-        """Hold states of :func:`record`; ``back`` runs the backward pass with derivatives by name."""
+        """Store the states of :func:`record`; ``back`` runs the backward pass with derivatives by name."""
         self.x, self.v, self.poses, self.mass, self._back = x, v, poses, mass, back
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:

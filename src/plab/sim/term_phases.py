@@ -61,7 +61,7 @@ class TermPhases(Storage):
     distance_terms: tuple[tuple[int, int, Any], ...] = ()
 
     def attach(self, terms: Sequence[LossTerm]) -> None:
-        """Take over the terms, before the first kernel is compiled.
+        """Attach the terms, before the first kernel is compiled.
 
         Args:
             terms: Terms as in :mod:`plab.losses.term`, not attached before; those of weight 0 are left out.
@@ -96,7 +96,7 @@ class TermPhases(Storage):
 
     def reference(self, name: str) -> ti.Field:
         """Field of n^3 numbers per environment with the targets' ``mass`` or ``sdf``, shared by all terms
-        that ask."""
+        that request it."""
         if name not in self.references:
             self.references[name] = self.share(ti.field(self.real, shape=self.batch * self.n**3))
         return self.references[name]

@@ -119,8 +119,8 @@ def _launcher_settings(launcher: DictConfig) -> Mapping[str, Any]:
 def jobs_of(
     words: Sequence[str], parameters: Mapping[str, Any], config_dir: str | None = None
 ) -> list[list[str]]:
-    """Return the overrides of each run of a sweep, given prepared overrides, of which Hydra's settings are
-    ignored, and an experiment's values by key, restricted by overrides."""
+    """Return the overrides of each run of a sweep, given prepared overrides and an experiment's values by
+    key, which overrides replace. Hydra's settings are ignored."""
     parsed = parse([*(f"{key}={value}" for key, value in parameters.items()), *words])
     # The last value of a key counts.
     given = {one.get_key_element(): one for one in parsed if not one.is_hydra_override()}
@@ -340,7 +340,7 @@ def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Carrier, int]]:
     try:
         yield partial(_dispatch, pools, places), len(places)
     except BaseException:
-        # After Ctrl-C: those that are at work write a checkpoint.
+        # After Ctrl-C, busy processes write a checkpoint.
         for process in multiprocessing.active_children():
             process.terminate()
         raise
@@ -384,7 +384,7 @@ def _pool(gpu: str) -> ProcessPoolExecutor:
 
 def _begin(gpu: str) -> None:
     os.environ[VISIBLE] = gpu
-    # Ctrl-C reaches all processes of a terminal: the one that has started this one sees to its end.
+    # Ctrl-C reaches all processes of a terminal; the parent process ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

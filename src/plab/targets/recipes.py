@@ -77,7 +77,8 @@ class TargetBody:
     sha256: str | None = None
 
     def build(self, particles: int) -> Body:
-        """Return the body with so many particles; see :func:`plab.scenes.make_body` for errors."""
+        """Return the body with the given number of particles; see :func:`plab.scenes.make_body` for
+        errors."""
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 
@@ -167,8 +168,8 @@ class PointsTarget(PointsRecipe):
     filled.
 
     Attributes:
-        file: NumPy array of shape [point, 3], PLY file (its vertices), or XYZ file. A relative one is looked
-            for in the working directory, in the config folder and in the folder above it.
+        file: NumPy array of shape [point, 3], PLY file (its vertices), or XYZ file. A relative path is
+            searched for in the working directory, in the config folder and in its parent folder.
         sha256: SHA-256 of the file. Default: computed; another checksum is rejected.
         fill: Fill the space that the points enclose.
     """

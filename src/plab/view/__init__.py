@@ -1,4 +1,4 @@
-"""A page that plays a rollout in 3-D: ``plab view``, and :func:`plab.view.show` in a notebook.
+"""3-D pages of rollouts: ``plab view``, and :func:`plab.view.show` in a notebook.
 
 K3D-jupyter, which draws with three.js, is optional: ``pip install 'plab[view]'``. docs/rendering.md has the
 details.
