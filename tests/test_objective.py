@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from plab.config import build_scene, load_config
 from plab.objective import (
     TARGET_ENTRIES,
     batch_scores,
     chamfer_distance,
     earth_movers_distance,
+    earth_movers_distances,
     mass_change,
     rewards,
     score_scale,
@@ -27,6 +29,8 @@ from plab.objective import (
     target_sdf,
     total_loss,
 )
+from plab.scenes import sample_particles
+from plab.targets import build_target
 
 N = 8
 
@@ -206,3 +210,19 @@ def test_distances_of_shapes_are_the_way_between_them():
     assert earth_movers_distance(a / a.sum() + b / b.sum(), a / a.sum() * 1.2 + 0.8 * b / b.sum()) == (
         pytest.approx(0.1 * 16 / 32, rel=0.05)
     )
+
+
+def test_distances_of_a_batch_are_close_to_the_exact_ones() -> None:
+    cfgs = [load_config([f"task={task}"]) for task in ("Move", "Rope", "TripleMove")]
+    scenes, like = [build_scene(cfg) for cfg in cfgs], torch.empty(0)
+    starts = [spread_mass(sample_particles(one), one.grid_size, one.particle_mass) for one in scenes]
+    targets = [build_target(one, cfg.task.target) for one, cfg in zip(scenes, cfgs, strict=True)]
+    exact = np.array([earth_movers_distance(*pair) for pair in zip(starts, targets, strict=True)])
+    bound = earth_movers_distances(starts, targets, like)
+    assert bound.dtype == torch.float64 and (bound.numpy() <= exact).all()
+    np.testing.assert_allclose(bound, exact, atol=0.002)
+    assert earth_movers_distances(starts[:1], targets[:1], like) == bound[0]
+    assert not earth_movers_distances(starts, starts, like).any()
+    # The distance of translated copies is the translation.
+    moved = earth_movers_distances(starts, np.roll(starts, (3, 2), axis=(1, 3)), like)
+    np.testing.assert_allclose(moved, np.hypot(3, 2) / 64, atol=0.006)

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import plab
 from plab.envs.goals import GoalEnv
 from plab.envs.sb3 import PlabVecEnv
+from plab.objective import earth_movers_distance
 from suite import make_not_finite
 from toy_runner import COARSE_32
 
@@ -92,10 +93,15 @@ def test_a_diverged_environment_is_truncated_and_the_others_go_on(vector, alone)
 
 
 def test_success_ends_an_episode_if_asked_to(alone) -> None:
-    env = plab.make_vec("Move", num_envs=2, overrides=COARSE, success_score=0.0, terminate_on_success=True)
-    env.reset()
+    options = {"success_score": 0.0, "terminate_on_success": True, "earth_movers": True}
+    env = plab.make_vec("Move", num_envs=2, overrides=COARSE, **options)
+    assert np.isnan(env.reset()[1]["earth_movers"]).all()
     _, _, terminated, truncated, info = env.step(np.zeros((2, 6)))
     assert terminated.all() and not truncated.any() and info["success"].all()
+    exact = map(
+        earth_movers_distance, env.batch.problem.simulator.mass_tensor(), env.batch.problem.target_mass
+    )
+    assert info["earth_movers"] == pytest.approx(list(exact), abs=0.002)
     env.close()
     assert alone[0].reset()[1]["success"] is False
     assert alone[0].spec.max_episode_steps == HORIZON

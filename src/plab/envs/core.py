@@ -23,6 +23,7 @@ from plab.config.randomization import Values, with_own_materials
 from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.envs.randomization import EpisodeRandomizer, Stages, staged
 from plab.errors import ArgumentError
+from plab.objective import earth_movers_distances
 from plab.problem import Problem, build_scenes, kinds_of, make_simulator, require_alike
 from plab.scenes import CONTACTS, Camera
 from plab.sim import SimulationError, Simulator, State
@@ -208,6 +209,7 @@ class EpisodeBatch:
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
         randomize: Mapping[str, Any] | None = None,
         impulses: bool = False,
+        earth_movers: bool = False,
         stages: bool = False,
         success_score: float = 0.9,
         terminate_on_success: bool = False,
@@ -225,6 +227,8 @@ class EpisodeBatch:
             randomize: Ranges of randomised parameters, replacing those of the tasks, see
                 :mod:`plab.config.randomization`; empty: none.
             impulses: Whether ``info`` contains the impulses on the manipulators; always if they are observed.
+            earth_movers: Whether ``info`` contains the earth mover's distances of episodes at their ends, see
+                :func:`plab.objective.earth_movers_distances`.
             stages: Whether episodes begin with the targets of ``task.stages``; set by :func:`make_batch`.
             success_score: Least score of a success.
             terminate_on_success: Whether a success ends the episode.
@@ -243,7 +247,7 @@ class EpisodeBatch:
         self._randomize, self._success_score = randomize, success_score
         self._terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)
-        self._sums_impulses = impulses or "impulses" in observe
+        self._sums_impulses, self._transports = impulses or "impulses" in observe, earth_movers
         problem = Problem(cfgs, make_simulator(cfgs, impulses=self._sums_impulses))
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
         self._picture_size, self._picture_target = render_size, render_target
@@ -469,12 +473,15 @@ class EpisodeBatch:
         self._update(observation, measured, kept=list(self.failures))
         observation, info = self._shown()
         reward = self._initial_loss.like(actions) - info["loss"]
-        if self._stages:
-            reward = self._go_on(self._stages, reward, info, actions)
-            observation = mapped(_copy, self._last[0])
         terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
         self._over = terminated | truncated
+        ended = np.flatnonzero(self._over if idle is None else self._over & ~idle)
+        if self._transports and (rows := np.setdiff1d(ended, list(self.failures))).size:
+            self._note_ends(rows, info)
+        if self._stages:
+            reward = self._go_on(self._stages, reward, info, actions)
+            observation = mapped(_copy, self._last[0])
         done = Transition(observation, reward, terminated, truncated, info, dict(self.failures))
         if self.listener is not None:
             self.listener(actions, done)
@@ -493,7 +500,8 @@ class EpisodeBatch:
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
             measured = self._measured(like)
             self._note_starts(rows, *measured[:2])
-            self._update(self._observe(like), measured, kept=list(self.failures))
+            others = [e for e in range(self.size) if e not in rows]
+            self._update(self._observe(like), measured, kept=others)
         info |= self._stage_info(info["score"])
         return reward
 
@@ -646,12 +654,23 @@ class EpisodeBatch:
         return self._sensors.noisy(observation, deviations, rngs, self._observer.constant)
 
     def _measured(self, like: Array = None) -> tuple[Array, ...]:
-        """Return loss terms, IoU and, if requested, impulses of the current states."""
+        """Return loss terms, IoU and, by name, requested measures of the current states."""
         measures = self._simulator.measure(like)
-        impulses = (self._simulator.impulses(like),) if self._sums_impulses else ()
-        return measures.terms, measures.iou, *impulses
+        requested = {"impulses": self._simulator.impulses(like)} if self._sums_impulses else {}
+        if self._transports:
+            requested["earth_movers"] = measures.iou * np.nan
+        return measures.terms, measures.iou, requested
 
-    def _info(self, terms: Array, iou: Array, impulses: Array = None) -> dict[str, Any]:
+    def _note_ends(self, rows: np.ndarray, info: Mapping[str, Any]) -> None:
+        """Add the earth mover's distances of the current states of some environments to ``info``."""
+        import torch
+
+        masses = self._simulator.mass_tensor()[rows], self.problem.target_mass[rows]
+        distances = earth_movers_distances(*masses, torch.empty(0, device=self._simulator.device))
+        for table in (info["earth_movers"], self._last[-1]["earth_movers"]):
+            table[rows] = _tensor_like(table, distances) if on_device(table) else _on_host(distances)
+
+    def _info(self, terms: Array, iou: Array, requested: Mapping[str, Array]) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
         drawn, success = self.draws.info(), score >= self._success_score
         if self._stages:
@@ -664,7 +683,7 @@ class EpisodeBatch:
             "score_printed": printed,
             "success": success,
             **self._stage_info(iou),
-            **({} if impulses is None else {"impulses": impulses}),
+            **requested,
             **({"randomized": drawn} if drawn else {}),
         }
 
