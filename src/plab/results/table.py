@@ -1,16 +1,18 @@
 """Folders and archives of results as one table, a row per run, with an index of unchanged files.
 
-The index is a Parquet file read by DuckDB. An entry is valid only while its file has the same size, inode and
-times. It is replaced atomically, and can be deleted at any time.
+The index is compressed JSON. An entry is valid only while its file has the same size, inode and times. It is
+replaced atomically, and can be deleted at any time.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import time
 import warnings
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -31,6 +33,7 @@ from plab.results.run_file import (
     opened,
     opened_archive,
     opened_member,
+    replace_file,
     split_archive,
     summary_of,
 )
@@ -63,7 +66,7 @@ COLUMNS = (
 )
 """Columns of every table of runs."""
 
-_INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
+_INDEX = f".plab-index-{SCHEMA_VERSION}.json.gz"
 
 _TIMESTAMP_RESOLUTION = 2.0
 """Age after which the times of a file identify its contents [s], because file systems round them."""
@@ -87,9 +90,9 @@ class Row:
         return Path(self.values["path"])
 
 
-Index = dict[str, tuple[str, str]]
-"""By path below the folder: identity of the file, and JSON of its runs: for each the name in an archive ("."
-for a file) and the two parts of :class:`Row`."""
+Index = dict[str, Any]
+"""By path below the folder: identity of the file, and its runs: for each the name in an archive ("." for a
+file) and the two parts of :class:`Row`."""
 
 
 def load(
@@ -264,7 +267,7 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
         entry = known.get(name)
         if entry is not None and entry[0] == identity:
             kept[name] = entry
-            for member, values, config in json.loads(entry[1]):
+            for member, values, config in entry[1]:
                 # The same folder may have another path in the next call.
                 yield Row(values | {"path": str(path / member)}, config)
             continue
@@ -274,9 +277,11 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
         # Damaged files are read again, because the message is part of the result.
         if own and len(found) == len(own) and now - status.st_mtime >= _TIMESTAMP_RESOLUTION:
             rows = [(row.path.relative_to(path).as_posix(), row.values, row.config) for row in found]
-            kept[name] = identity, json.dumps(rows)
+            kept[name] = identity, rows
     if index and kept != known:
-        _write(place, kept)
+        # Without an index, a read-only folder is read in full each time.
+        with suppress(ResultsError):
+            replace_file(place, gzip.compress(json.dumps(kept).encode(), 1))
 
 
 def _final(partial: Path) -> Path:
@@ -353,31 +358,6 @@ def _index_place(root: Path) -> Path:
 
 def _stored(place: Path) -> Index:
     """Return the index; empty if it is missing or damaged."""
-    if not place.exists():
-        return {}
-    import duckdb
-
-    with suppress(duckdb.Error), duckdb.connect() as connection:
-        found = connection.execute("SELECT file, identity, rows FROM read_parquet(?)", [str(place)])
-        return {file: (identity, rows) for file, identity, rows in found.fetchall()}
+    with suppress(OSError, EOFError, ValueError, zlib.error):
+        return dict(json.loads(gzip.decompress(place.read_bytes())))
     return {}
-
-
-def _write(place: Path, entries: Index) -> None:
-    """Replace the index, if the folder is writable."""
-    import duckdb
-    import pandas as pd
-
-    table = [(name, *entry) for name, entry in entries.items()]
-    temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with duckdb.connect() as connection:
-            frame = pd.DataFrame(table, columns=["file", "identity", "rows"], dtype=object)
-            connection.register("entries", frame)
-            target = str(temporary).replace("'", "''")
-            connection.execute(f"COPY entries TO '{target}' (FORMAT parquet, COMPRESSION zstd)")
-        os.replace(temporary, place)
-    except (OSError, duckdb.Error):
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
