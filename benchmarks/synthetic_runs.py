@@ -16,8 +16,8 @@ from plab.config.run import member_name
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.objective import scores_from_iou
 from plab.results import RunResult, config_dict, config_hash, write
+from plab.results.run_file import COLUMNS, loss_columns
 from plab.results.running import now, provenance
-from plab.results.schema import COLUMNS, loss_columns
 
 __all__ = ["SETTLE", "synthetic_run", "template", "write_runs"]
 

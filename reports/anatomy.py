@@ -39,7 +39,7 @@ from plab.report.figures import PHASES, Drawing, grid, legend, single, style
 from plab.report.methods import method
 from plab.report.notebook_cells import gather, say, show_figure, show_table
 from plab.results import read
-from plab.results.schema import loss_columns
+from plab.results.run_file import loss_columns
 
 if RUN is None:
     table = gather(RESULTS, WORDS).table.sort_values(["score", "config_hash"], ascending=[False, True])

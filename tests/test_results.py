@@ -22,7 +22,7 @@ from plab.results import (
     read,
     write,
 )
-from plab.results.schema import COLUMNS, last_score
+from plab.results.run_file import COLUMNS, last_score
 
 
 def make_config(folder: Path, **changes) -> dict:

@@ -33,9 +33,10 @@ class LazyModule(ModuleType):
 
 
 if TYPE_CHECKING:
+    import pandas
     import torch
 else:
-    torch = LazyModule("torch")
+    pandas, torch = LazyModule("pandas"), LazyModule("torch")
 
 
 class Registry(UserDict[str, Any]):

@@ -19,7 +19,6 @@ mass tensor.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +34,7 @@ from plab.config import build_scene
 from plab.demonstrations import known_actions
 from plab.losses import make_terms
 from plab.objective import scores, spread_mass, target_sdf
+from plab.plugins import pandas as pd
 from plab.scenes import CONTACTS, DEVICES, PRECISIONS, Body, Scene, sample_particles
 from plab.sim import Simulator
 
@@ -253,8 +253,6 @@ def rows(tasks: Sequence[str], plan: Plan, device: str) -> Iterator[dict[str, An
 @command_line
 def main(argv: Sequence[str]) -> None:
     """Compare settings with references, print, write the table and the diagrams."""
-    import pandas as pd
-
     from plab.report.figures import diagrams, save, style
 
     parser = Parser("plab bench accuracy", __doc__)
@@ -279,7 +277,3 @@ def main(argv: Sequence[str]) -> None:
     save(drawings, output, "plab bench accuracy")
     for drawing in drawings:
         print(output / f"{drawing.name}.png")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,7 +14,6 @@ from __future__ import annotations
 import gc
 import itertools
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -137,7 +136,3 @@ def main(argv: Sequence[str]) -> int:
     parts = (rows(*cell, steps, repeats, kinds) for cell in cells)
     table = measure_table(COLUMNS, itertools.chain.from_iterable(parts), options.csv, widths)
     return 0 if len(table) == len(cells) * len(kinds) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,7 +13,6 @@ are inside the domain, and the mass tensor contains all mass. The exit code is 1
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -149,7 +148,3 @@ def main(argv: Sequence[str]) -> int:
     options = parser.parse_intermixed_args(argv)
     each = (rows(precision, options.quick) for precision in options.precision)
     return summarise(measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

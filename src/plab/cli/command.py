@@ -156,7 +156,7 @@ def sources_and_words(
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     """Return the finished runs that match selections, all of one protocol; raise ResultsError if there are
     none."""
-    from plab.results.schema import NAMES, ResultsError
+    from plab.results.run_file import NAMES, ResultsError
     from plab.results.table import rows
 
     chosen = select(words, NAMES)

@@ -29,7 +29,7 @@ from plab.errors import tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.query import query, scores
-from plab.results.schema import ResultsError
+from plab.results.run_file import ResultsError
 from plab.results.table import rows
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")

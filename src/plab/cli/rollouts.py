@@ -184,7 +184,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         plab.config.ConfigError: If the configuration is wrong.
     """
     # Imported here, as below, because h5py and pandas are slow to load.
-    from plab.results.schema import ARCHIVE_SUFFIX
+    from plab.results.run_file import ARCHIVE_SUFFIX, split_archive
 
     sources, words = sources_and_words(options.what, default=None)
     if sources and all(str(one).endswith(ARCHIVE_SUFFIX) or one.is_dir() for one in sources):
@@ -193,8 +193,6 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     elif len(sources) > 1 or (sources and words):
         raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'")
     elif sources:
-        from plab.results.run_file import split_archive
-
         (options.result,) = sources
         place = Path() if split_archive(options.result) else options.result.parent
         usual = place / (options.result.stem + ending)

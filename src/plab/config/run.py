@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plab.config import ranges
+from plab.config.families import family
 from plab.config.selection import lookup
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
@@ -54,6 +55,10 @@ class MethodConfig(ranges.Section):
         check_terms(self.loss_weights, self.loss_terms)
         if not any(self.loss_weights.values()):
             raise ConfigError(f"{path}.loss_weights are all 0: at least one must be positive")
+        rules = family(self.family).rules
+        for key in ("algorithm", "optimizer"):
+            if rules and hasattr(self, key):
+                ranges.one_of(f"{path}.{key}", getattr(self, key), tuple(rules))
 
 
 Method = TypeVar("Method", bound=MethodConfig)

@@ -19,7 +19,7 @@ from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_t
 from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
-from plab.results.schema import NAMES
+from plab.results.run_file import NAMES
 from plab.results.table import sources_of
 
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")

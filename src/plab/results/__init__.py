@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config.run import config_dict, config_hash
 from plab.config.selection import lookup
-from plab.results.running import RunFile, read, write
-from plab.results.schema import (
+from plab.results.run_file import (
     BUDGETS,
     SCHEMA_VERSION,
     STATUSES,
@@ -25,6 +24,7 @@ from plab.results.schema import (
     RunResult,
     row_count,
 )
+from plab.results.running import RunFile, read, write
 
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack

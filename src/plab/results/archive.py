@@ -20,8 +20,7 @@ import numpy as np
 
 from plab.config.run import member_name
 from plab.config.selection import Selection
-from plab.results.run_file import encode, read, replace_file
-from plab.results.schema import ARCHIVE_SUFFIX, ResultsError, RunResult
+from plab.results.run_file import ARCHIVE_SUFFIX, ResultsError, RunResult, encode, read, replace_file
 from plab.results.table import Row, rows
 
 

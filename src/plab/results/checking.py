@@ -11,8 +11,7 @@ import numpy as np
 from plab.config.families import SOLVED, known_family
 from plab.config.run import config_hash
 from plab.objective import scores_from_iou
-from plab.results.run_file import run_of
-from plab.results.schema import (
+from plab.results.run_file import (
     BUDGETS,
     COLUMNS,
     EVALUATION,
@@ -22,6 +21,7 @@ from plab.results.schema import (
     RunResult,
     loss_columns,
     row_count,
+    run_of,
 )
 from plab.results.table import read_each, run_files
 

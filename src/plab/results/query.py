@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config.selection import Selection, leaves, lookup
 from plab.errors import ArgumentError
-from plab.results.schema import NAMES, ResultsError
+from plab.plugins import pandas as pd
+from plab.results.run_file import NAMES, ResultsError
 from plab.results.table import COLUMNS, Row, read_curves, rows, sources_of, warn_of
 
 if TYPE_CHECKING:
     import duckdb
-    import pandas as pd
 
 
 def connect(
@@ -88,8 +88,6 @@ def scores(
         ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    import pandas as pd
-
     found, unreadable = rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
     columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
@@ -121,7 +119,6 @@ def _connected(
     sources: Sequence[Path], iterations: bool
 ) -> tuple[duckdb.DuckDBPyConnection, list[ResultsError]]:
     import duckdb
-    import pandas as pd
 
     found, unreadable = rows(sources)
     runs, config = [], []
@@ -158,7 +155,5 @@ def _value(row: Row, name: str) -> Any:
 
 def _comparable(column: pd.Series) -> pd.Series:
     """Return the sort key of a column: numbers and numeric text by value, others as text."""
-    import pandas as pd
-
     numbers = pd.to_numeric(column, errors="coerce")
     return numbers if (numbers.notna() | column.isna()).all() else column.map(str, na_action="ignore")

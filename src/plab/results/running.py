@@ -31,14 +31,15 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from plab.config.run import config_dict, config_hash, member_name
-from plab.results.run_file import read, write
-from plab.results.schema import (
+from plab.results.run_file import (
     PARTIAL_SUFFIX,
     REPLAY_SUFFIX,
     NewerSchemaError,
     ResultsError,
     RunBusyError,
     RunResult,
+    read,
+    write,
 )
 
 _log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -26,30 +26,26 @@ import numpy as np
 from plab.config.run import SUFFIX
 from plab.config.selection import lookup
 from plab.files import cache_dir
+from plab.plugins import pandas as pd
 from plab.results.examples import resolve
 from plab.results.run_file import (
-    actions_of,
-    columns_of,
-    opened,
-    opened_archive,
-    opened_member,
-    replace_file,
-    split_archive,
-    summary_of,
-)
-from plab.results.schema import (
     ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
     SCHEMA_VERSION,
     ResultsError,
+    actions_of,
+    columns_of,
     last_score,
+    opened,
+    opened_archive,
+    opened_member,
+    replace_file,
     scores_last_iteration,
+    split_archive,
     stored_config,
+    summary_of,
 )
-from plab.results.schema import COLUMNS as ITERATION_COLUMNS
-
-if TYPE_CHECKING:
-    import pandas as pd
+from plab.results.run_file import COLUMNS as ITERATION_COLUMNS
 
 T = TypeVar("T")
 
@@ -122,8 +118,6 @@ def load(
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
-    import pandas as pd
-
     found, unreadable = rows(source, index=index)
     warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]

@@ -54,10 +54,6 @@ class PlannerConfig(MethodConfig):
     action_init: float = field(metadata=ranges.UNIT)
     contact_starts: float = field(metadata=ranges.UNIT)
 
-    def check(self, path: str) -> None:
-        super().check(path)
-        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-
 
 @dataclass(frozen=True)
 class Request:

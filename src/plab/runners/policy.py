@@ -74,10 +74,6 @@ class PolicyConfig(MethodConfig):
     lr: float = field(metadata=ranges.POSITIVE)
     hidden: list[int] = field(metadata=ranges.WIDTHS)
 
-    def check(self, path: str) -> None:
-        super().check(path)
-        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-
 
 class Spaces(NamedTuple):
     """Spaces of an observation and of an action."""

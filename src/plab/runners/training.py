@@ -22,7 +22,7 @@ from plab.config import Config, ConfigError, ranges
 from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
 from plab.plugins import torch
-from plab.results.schema import REPLAY_SUFFIX
+from plab.results.run_file import REPLAY_SUFFIX
 from plab.runners.policy import (
     CLIP,
     Moments,

@@ -56,10 +56,6 @@ class TrajectoryConfig(MethodConfig):
     iterations: int = field(metadata=ranges.COUNT)
     action_init: float = field(metadata=ranges.UNIT)
 
-    def check(self, path: str) -> None:
-        super().check(path)
-        ranges.one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
-
 
 class TrajectoryRunner(Runner):
     """Runner of a sequence of actions per run; each iteration is one rollout of all, with gradient.

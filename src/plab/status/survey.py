@@ -14,9 +14,8 @@ import pandas as pd
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.results import ResultsError, Row, row_count
-from plab.results.run_file import columns_of, opened, split_archive, summary_of
+from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
 from plab.results.running import held
-from plab.results.schema import NAMES
 from plab.results.table import rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")

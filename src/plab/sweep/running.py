@@ -35,8 +35,8 @@ from plab.errors import tell
 from plab.plugins import exported_module_path
 from plab.problem import build_scenes
 from plab.results import ResultsError, RunFile, read, row_count
+from plab.results.run_file import PARTIAL_SUFFIX
 from plab.results.running import held, lock_path
-from plab.results.schema import PARTIAL_SUFFIX
 from plab.runners.runner import Outcome, SimulatorCache, report
 from plab.scenes import Scene, SceneError
 from plab.sim.batch import scene_kind
