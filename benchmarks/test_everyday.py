@@ -1,6 +1,6 @@
 """Timing of everyday operations before and after a change: ``make benchmark``.
 
-The simulator's own benchmark, with phases, batches and devices, is ``python -m plab.bench.speed``.
+The simulator's own benchmark, with phases, batches and devices, is ``plab bench speed``.
 """
 
 from __future__ import annotations
