@@ -16,8 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from plab.bench.workload import GRADIENT, KINDS, Workload, build, time_calls
-from plab.cli.command import Parser, command_line, positive, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, to_write
 from plab.config import Config, load_config
 from plab.sim.compiler import ti
 from plab.sim.cpu_engine import MIN_TASK_SIZE

@@ -21,8 +21,7 @@ import pandas as pd
 
 from common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.bench.accuracy import angle
-from plab.cli.command import Parser, command_line, positive, task_list, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, task_list, to_write
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions

@@ -18,12 +18,12 @@ import time
 from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 
-from plab.cli.tables import measure_table
+from plab.cli.command import measure_table
 from plab.config.selection import Selection
 from plab.report.collect import collect
 from plab.report.writing import write_tables
 from plab.results import load, pack
-from plab.results.query import query, scores
+from plab.results.table import query, scores
 from plab.status import survey
 from synthetic_runs import SETTLE, write_runs
 

@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 
-from plab.cli.tables import measure_table
+from plab.cli.command import measure_table
 from plab.config import Config, load_config
 from plab.config.families import FAMILIES
 from plab.envs.core import EpisodeBatch

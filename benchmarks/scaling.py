@@ -14,8 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from plab.bench.workload import FORWARD, GRADIENT, build, time_calls, with_particles
-from plab.cli.command import Parser, command_line, positive, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, to_write
 from plab.sim.storage import BLOCK
 
 COLUMNS = (

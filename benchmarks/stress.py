@@ -29,8 +29,7 @@ import pandas as pd
 
 from common_scene import common_actions, common_scene
 from plab.bench.stability import ACTIONS, COLUMNS, stress, stress_simulator, summarise
-from plab.cli.command import Parser, command_line, positive, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, to_write
 from plab.config import ConfigError, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.scenes import PRECISIONS, Body, Manipulator, Scene, SceneError, Vec3, vector3

@@ -80,7 +80,7 @@ def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
 def test_the_best_episode_of_each_budget_is_kept(
     tmp_path: Path, env: gymnasium.Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plab.submissions.collecting.BUDGETS", (6, 13))
+    monkeypatch.setattr("plab.submissions.verifying.BUDGETS", (6, 13))
     # Whatever the environment is wrapped in, the actions that it takes are recorded.
     rescaled = RescaleAction(record(env, tmp_path), np.float32(-2), np.float32(2))
     pairs = zip((env, rescaled, env), PLANS * [[[1]], [[2]], [[1]]], strict=True)

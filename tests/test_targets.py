@@ -21,7 +21,7 @@ from plab.targets import (
     load_release_target,
     make_recipe,
 )
-from plab.targets.store import TargetStore
+from plab.targets.build import TargetStore
 from toy_runner import COARSE_32
 
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}

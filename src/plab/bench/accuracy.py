@@ -28,8 +28,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.command import Parser, command_line, folder, task_list
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, folder, measure_table, task_list
 from plab.config import build_scene
 from plab.demonstrations import known_actions
 from plab.losses import make_terms

@@ -18,8 +18,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from plab.bench.workload import FORWARD, GRADIENT, KINDS, REWARD, build, peak_rss_mb, time_calls
-from plab.cli.command import Parser, command_line, positive, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, to_write
 from plab.config import Config, load_config
 from plab.config.overrides import parse, prepared
 from plab.config.suite import suite_tasks

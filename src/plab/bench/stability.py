@@ -20,8 +20,7 @@ import numpy as np
 import pandas as pd
 
 from plab.bench.workload import with_particles
-from plab.cli.command import Parser, command_line, to_write
-from plab.cli.tables import measure_table, print_table
+from plab.cli.command import Parser, command_line, measure_table, print_table, to_write
 from plab.config import build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms

@@ -8,8 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from plab.cli.command import Parser, command_line, positive, sources_and_words, to_write
-from plab.cli.tables import measure_table
+from plab.cli.command import Parser, command_line, measure_table, positive, sources_and_words, to_write
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVATION_KEYS
 from plab.envs.core import EpisodeBatch

@@ -15,8 +15,15 @@ import numpy as np
 import yaml
 from gymnasium.spaces import Dict, Space
 
-from plab.cli.command import Parser, command_line, finished_rows, folder, positive, sources_and_words
-from plab.cli.tables import print_table
+from plab.cli.command import (
+    Parser,
+    command_line,
+    finished_rows,
+    folder,
+    positive,
+    print_table,
+    sources_and_words,
+)
 from plab.config import Config
 from plab.config.compose import check_sources, require_runnable
 from plab.config.overrides import parse, prepared

@@ -20,17 +20,16 @@ from plab.cli.command import (
     command_line,
     folder,
     positive,
+    print_table,
     results_source,
     sources_and_words,
 )
-from plab.cli.tables import print_table
 from plab.config.selection import require_possible, select
 from plab.errors import tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
-from plab.results.query import query, scores
 from plab.results.run_file import ResultsError
-from plab.results.table import rows
+from plab.results.table import query, rows, scores
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import plab
-from plab.cli.command import Parser, command_line, folder, positive, sources_and_words, to_write
-from plab.cli.tables import print_table
+from plab.cli.command import Parser, command_line, folder, positive, print_table, sources_and_words, to_write
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import PlabError, tell
@@ -17,7 +16,6 @@ from plab.report.page import asset, render
 from plab.report.statistics import BUDGETS
 from plab.results.run_file import replace_file
 from plab.submissions.board import board
-from plab.submissions.collecting import from_policies, from_sources, submission_files
 from plab.submissions.submission import (
     SUFFIX,
     UNSEEN,
@@ -28,9 +26,16 @@ from plab.submissions.submission import (
     read,
     write,
 )
-from plab.submissions.verifying import HOLDS, TOLERANCE, write_verification
+from plab.submissions.verifying import (
+    HOLDS,
+    TOLERANCE,
+    from_policies,
+    from_sources,
+    submission_files,
+    write_verification,
+)
 from plab.submissions.verifying import verify as simulate_again
-from plab.targets.store import PHYSICS_VERSION
+from plab.targets.build import PHYSICS_VERSION
 
 _PACKAGE = "plab.submissions"
 """Folder of the page's templates."""

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from plab.cli.command import Parser, command_line, task_list, to_write
-from plab.cli.tables import print_table
+from plab.cli.command import Parser, command_line, print_table, task_list, to_write
 from plab.config import Config, build_scene, load_config
 from plab.config.compose import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks

@@ -29,8 +29,7 @@ from plab.results.running import RunFile, read, write
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack
     from plab.results.checking import check
-    from plab.results.query import connect
-    from plab.results.table import Row, load, read_curves, rows
+    from plab.results.table import Row, connect, load, read_curves, rows
 
 __all__ = [
     "BUDGETS",

@@ -4,6 +4,6 @@
 leaderboard`` generates a page; see docs/submissions.md.
 """
 
-from plab.submissions.collecting import record
+from plab.submissions.verifying import record
 
 __all__ = ["record"]

@@ -17,9 +17,8 @@ from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import BUDGETS
 from plab.results import ResultsError
-from plab.submissions.collecting import submission_files
 from plab.submissions.submission import UNSEEN, Card, SubmissionError, read
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_verification
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_verification, submission_files
 
 PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}

@@ -27,7 +27,7 @@ from plab.files import UnreadableError, array_in, one_line, read_members
 from plab.results import ResultsError
 from plab.results.archive import zipped
 from plab.results.run_file import explained, replace_file
-from plab.targets.store import PHYSICS_VERSION
+from plab.targets.build import PHYSICS_VERSION
 
 SUFFIX = ".plabsub.zip"
 """End of the names of submissions."""
@@ -157,7 +157,7 @@ class Submission:
         entries: Plans, or policies.
         policies: Files of the policies, by name.
         plab: Version of plab that wrote the file.
-        physics: Version of the physics, :data:`plab.targets.store.PHYSICS_VERSION`.
+        physics: Version of the physics, :data:`plab.targets.build.PHYSICS_VERSION`.
         path: The file.
         digest: SHA-256 of its file, in hex; empty if it was not read from a file.
     """

@@ -10,6 +10,7 @@ from plab.targets.build import (
     build_targets,
     check_target,
     demonstration,
+    load_release_target,
     make_recipe,
 )
 from plab.targets.recipes import (
@@ -22,7 +23,6 @@ from plab.targets.recipes import (
     TargetBody,
     TargetError,
 )
-from plab.targets.store import load_release_target
 
 __all__ = [
     "EPISODE_STEPS",
