@@ -59,8 +59,7 @@ __all__ = [
 _MODULES = {
     "archive": ("pack", "unpack"),
     "checking": ("check",),
-    "query": ("connect",),
-    "table": ("Row", "load", "read_curves", "rows"),
+    "table": ("Row", "connect", "load", "read_curves", "rows"),
 }
 """Names of each module that is imported on first use."""
 
