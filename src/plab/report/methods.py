@@ -5,29 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from plab.config.families import FAMILIES
+from plab.config.families import FAMILIES, Appearance
 from plab.config.suite import PAPER_METHODS
 
 
 @dataclass(frozen=True)
-class Method:
-    """Appearance of a method.
+class Method(Appearance):
+    """A method and its appearance.
 
     Attributes:
         name: Name in results and configuration.
-        label: Name for readers.
         kind: :data:`~plab.config.families.RL` or :data:`~plab.config.families.GRADIENT`; empty for a method
             that is not plab's.
-        colour: Colour of its curves.
-        dashes: Line style, for readers who cannot distinguish colours.
-        of: Method that the runs are a part of, see :func:`part`; empty for a whole method.
+        of: Method of which these are some of the runs, empty for all: see :func:`part`.
     """
 
-    name: str
-    label: str
-    kind: str
-    colour: str
-    dashes: str = "-"
+    name: str = ""
+    kind: str = ""
     of: str = ""
 
     @property
@@ -37,7 +31,7 @@ class Method:
 
 
 _STYLES = {
-    name: Method(name, look.label, family.kind, look.colour, look.dashes)
+    name: Method(**vars(look), name=name, kind=family.kind)
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
@@ -47,7 +41,7 @@ _KNOWN = tuple(_STYLES[name] for name in dict.fromkeys((*PAPER_METHODS, *_STYLES
 
 def method(name: str) -> Method:
     """Return the appearance of a method; unknown methods are grey and have no kind."""
-    return _STYLES.get(name) or Method(name, name, "", "#777777", ":")
+    return _STYLES.get(name) or Method(name, "#777777", ":", name)
 
 
 _PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
@@ -69,8 +63,8 @@ def part(name: str, key: str, value: str, place: int) -> str:
         Name of the new one.
     """
     whole, new = method(name), f"{name} {key}={value}"
-    look = {"colour": _PALETTE[place % len(_PALETTE)], "dashes": _DASHES[place % len(_DASHES)]}
-    _STYLES[new] = Method(new, f"{whole.label}, {key} {value}", whole.kind, of=name, **look)
+    colour, dashes = _PALETTE[place % len(_PALETTE)], _DASHES[place % len(_DASHES)]
+    _STYLES[new] = Method(f"{whole.label}, {key} {value}", colour, dashes, new, whole.kind, name)
     return new
 
 
