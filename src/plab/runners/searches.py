@@ -23,15 +23,7 @@ import numpy as np
 from plab.config import ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
 from plab.plugins import torch
-from plab.runners.planner import (
-    Asking,
-    Planner,
-    PlannerConfig,
-    PlannerRunner,
-    Request,
-    Stages,
-    StagesConfig,
-)
+from plab.runners.planner import Asking, Planner, PlannerConfig, PlannerRunner, Request, Stages, StagesConfig
 
 if TYPE_CHECKING:
     from cmaes import CMA
