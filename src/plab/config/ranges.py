@@ -60,6 +60,7 @@ COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
 FINITE = within(at_least, 0, finite=True)
 FRACTION = _in_range("in [0, 1)", lambda value: 0 <= value < 1)
 SHARE = _in_range("in (0, 1]", lambda value: 0 < value <= 1)
+SEED = _in_range("at least 0 and below 2^32", lambda value: 0 <= value < 2**32)
 UNIT = _in_range("in [0, 1]", lambda value: 0 <= value <= 1)
 DECAYS = _in_range("two numbers in [0, 1)", lambda value: len(value) == sum(0 <= v < 1 for v in value) == 2)
 WIDTHS = _in_range("numbers of at least 1", lambda value: all(width >= 1 for width in value))
@@ -68,11 +69,15 @@ THREADS = COUNT
 
 
 class Section:
-    """A section of the configuration; the metadata of its fields define the valid values besides None."""
+    """A section of the configuration; the metadata of its fields define the valid values besides None.
+    Sections in it are checked, too."""
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         for field in fields(cast(Any, self)):
-            value = getattr(self, field.name)
+            value, place = getattr(self, field.name), f"{path}.{field.name}".lstrip(".")
             if value is not None and "check" in field.metadata:
-                field.metadata["check"](f"{path}.{field.name}", value)
+                field.metadata["check"](place, value)
+            for name, part in value.items() if isinstance(value, dict) else [("", value)]:
+                if isinstance(part, Section):
+                    part.check(f"{place}.{name}".rstrip("."))

@@ -131,7 +131,7 @@ class TargetsConfig:
 
 
 @dataclass
-class Config:
+class Config(ranges.Section):
     """A run: one task and variant, one method, one seed.
 
     Attributes:
@@ -160,16 +160,16 @@ class Config:
     sim: SimConfig
     targets: TargetsConfig
     variant: str
-    seed_scene: int | None
-    seed_particles: int
-    observe_particles: int
+    seed_scene: int | None = field(metadata=ranges.NOT_NEGATIVE)
+    seed_particles: int = field(metadata=ranges.SEED)
+    observe_particles: int = field(metadata=ranges.COUNT)
     observe_target: bool
-    seed: int
+    seed: int = field(metadata=ranges.SEED)
     results_dir: str
     force: bool
     progress: bool
-    logger: str
-    checkpoint_seconds: float
+    logger: str = field(metadata=ranges.within(ranges.one_of, LOGGERS))
+    checkpoint_seconds: float = field(metadata=ranges.FINITE)
 
     @property
     def hash(self) -> str:
@@ -181,24 +181,13 @@ class Config:
         """Result file: ``results_dir/<task>-v<variant>/<method>/seed<k>-<hash8>.h5``."""
         return Path(self.results_dir) / member_name(config_dict(self), self.hash)
 
-    def check(self) -> None:
+    def check(self, path: str = "") -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        for key in ("seed", "seed_particles"):
-            if (seed := getattr(self, key)) >= 2**32:
-                raise ConfigError(f"{key} must be below 2^32 = {2**32}, not {seed}")
-            ranges.at_least(key, seed, 0)
-        ranges.at_least("observe_particles", self.observe_particles, 1)
-        ranges.at_least("seed_scene", self.seed_scene or 0, 0)
-        ranges.one_of("logger", self.logger, LOGGERS)
-        ranges.at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
+        super().check(path)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")
         if self.targets.source is not None and self.seed_scene is not None:
             raise ConfigError("targets.source has no files for variant=random: leave one of them out")
-        self.task.check("task")
-        self.method.check("method")
-        self.protocol.check("protocol")
-        self.sim.check("sim")
 
     def method_as(self, kind: type[Method]) -> Method:
         """Return the section ``method``; TypeError unless it is of a runner's type."""

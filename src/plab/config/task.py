@@ -199,7 +199,7 @@ class KinematicsConfig(ranges.Section):
 
 
 @dataclass
-class RangeConfig:
+class RangeConfig(ranges.Section):
     """Numbers sampled uniformly and independently, each between two bounds.
 
     Attributes:
@@ -252,9 +252,6 @@ class RandomConfig(ranges.Section):
         super().check(path)
         if self.shift is not None:
             ranges.vector(f"{path}.shift.low", self.shift.low, 3)
-            self.shift.check(f"{path}.shift")
-        for name, draw in (self.ranges or {}).items():
-            draw.check(f"{path}.ranges.{name}")
 
 
 @dataclass
@@ -307,11 +304,6 @@ class TaskConfig(ranges.Section):
         super().check(path)
         for variant in self.variants:
             ranges.folder_name(f"{path}.variants", variant)
-        for group in ("bodies", "manipulators"):
-            for name, item in getattr(self, group).items():
-                item.check(f"{path}.{group}.{name}")
-        if self.kinematics is not None:
-            self.kinematics.check(f"{path}.kinematics")
         for place, target in [("", self.target), *((f"stages: {k}: ", t) for k, t in enumerate(self.stages))]:
             try:
                 make_recipe(target)

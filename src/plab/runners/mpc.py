@@ -59,7 +59,6 @@ class MpcConfig(MethodConfig):
             raise ConfigError(
                 f"{path}.execute must be at most {path}.window={self.window} (got {self.execute})"
             )
-        self.planner.check(f"{path}.planner")
 
     @property
     def population(self) -> int:

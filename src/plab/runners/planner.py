@@ -221,7 +221,6 @@ class StagesConfig(MethodConfig):
                     raise ConfigError(
                         f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
                     )
-            stage.check(f"{path}.stages.{name}")
 
 
 class Stages:
