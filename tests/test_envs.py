@@ -198,6 +198,7 @@ def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVe
             one.step(action)
         state, copied = one.get_state(), duplicate(one)
         wanted = [one.step(action) for action in actions[2:]]
+        assert copied.spec == one.spec
         again = one.set_state(state)
         assert data_equivalence(again, copied.set_state(copied.get_state()), exact=True)
         assert copied.np_random.random() == one.np_random.random()
@@ -328,6 +329,9 @@ def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
     assert env.get_attr("note", 1) == ["all"]
     with pytest.raises(ValueError, match="'note'"):
         env.set_attr("note", "one", indices=0)
+    assert env.spec.max_episode_steps == HORIZON
+    with pytest.raises(TypeError, match="cannot be copied"):
+        copy.deepcopy(env)
     with pytest.raises(AttributeError, match="'jump'"):
         env.env_method("jump")
     env.set_options({"start": 1})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 
@@ -104,7 +105,7 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
     assert info["earth_movers"] == pytest.approx(list(exact), abs=0.002)
     env.close()
     assert alone[0].reset()[1]["success"] is False
-    assert alone[0].spec.max_episode_steps == HORIZON
+    assert alone[0].spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == HORIZON
 
 
 def test_stages_ask_for_one_target_after_the_other() -> None:
@@ -163,6 +164,7 @@ def test_goals_agree_with_hindsight() -> None:
 
 def test_wrappers_of_environments(alone) -> None:
     env, picture = alone[0], plab.make("Move", overrides=COARSE, **PICTURES)
+    drawn = plab.make("Move", overrides=COARSE, render_mode="rgb_array")
     colours, size = plab.make("Move", overrides=COARSE, observe="rgb"), env.observation_space.shape[0]
     wrapped = [
         single.AddWhiteNoise(colours, 0.1),
@@ -183,6 +185,8 @@ def test_wrappers_of_environments(alone) -> None:
         single.MaxAndSkipObservation(env, 2),
         single.FlattenObservation(picture),
         single.FilterObservation(picture, ["front_depth"]),
+        single.AddRenderObservation(drawn, render_only=False),
+        single.RenderCollection(drawn),
         single.ClipAction(env),
         single.RescaleAction(env, -2.0, 2.0),
         single.StickyAction(env, 0.5),
@@ -199,8 +203,8 @@ def test_wrappers_of_environments(alone) -> None:
         assert one.observation_space.contains(observation), one
         while not (result := one.step(one.action_space.sample()))[3]:
             assert one.observation_space.contains(result[0]), one
-    picture.close()
-    colours.close()
+    for one in (picture, colours, drawn):
+        one.close()
 
 
 def test_wrappers_of_vector_environments(vector) -> None:
@@ -235,6 +239,15 @@ def test_wrappers_of_vector_environments(vector) -> None:
         for _ in range(HORIZON + (mode != AutoresetMode.DISABLED)):
             assert one.observation_space.contains(observation), one
             observation, *_ = one.step(one.action_space.sample())
+
+
+def test_wrappers_of_pictures_in_vector_environments() -> None:
+    chosen = functools.partial(many.FilterObservation, filter_keys=["front_depth"])
+    for observe, wrapper in (("rgb", many.GrayscaleObservation), (["state", "depth"], chosen)):
+        one = wrapper(plab.make_vec("Move", num_envs=2, overrides=COARSE, observe=observe))
+        assert one.observation_space.contains(one.reset()[0])
+        assert one.observation_space.contains(one.step(np.zeros((2, 6)))[0])
+        one.close()
 
 
 def test_threads_and_forks(alone) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config, ranges
@@ -698,6 +699,19 @@ class Restorable:
     batch: EpisodeBatch
     _arguments: dict[str, Any]
 
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's specification; its ``max_episode_steps`` is ``sim.horizon``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = copy.copy(value)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.batch.horizon
+
+    _spec: EnvSpec | None = None
+
     def __getstate__(self) -> dict[str, Any]:
         """Return arguments, state and random numbers; raise TypeError if the simulator was changed
         directly."""
@@ -710,6 +724,7 @@ class Restorable:
         return {
             "arguments": self._arguments,
             "state": self.batch.get_state(),
+            "spec": self.spec,
             "random": (getattr(self, "_np_random", None), getattr(self, "_np_random_seed", None)),
         }
 
@@ -717,6 +732,7 @@ class Restorable:
         """Rebuild the environment, and restore the state."""
         self.__init__(**kept["arguments"])  # type: ignore[misc]
         self.batch.set_state(kept["state"])
+        self.spec = kept["spec"]
         self._is_seeded = True
         self._np_random, self._np_random_seed = kept["random"]
 

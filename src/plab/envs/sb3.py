@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -47,7 +48,7 @@ class PlabVecEnv(VecEnv):
 
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
-        spec: Gymnasium's specification of one sub-environment, if any.
+        spec: Gymnasium's specification of one sub-environment, if any, with ``sim.horizon`` steps.
         together: Whether all episodes end together: a diverged episode is then frozen until the end, with the
             reason as ``failure`` in its infos. Otherwise it is truncated and reset immediately.
         next_episode: Number of the episodes started by the next :meth:`reset`; default: the following one.
@@ -70,7 +71,9 @@ class PlabVecEnv(VecEnv):
             ValueError: If the render mode does not exist.
         """
         self.batch = batch
-        self.spec = spec
+        self.spec = copy.copy(spec)
+        if self.spec is not None:
+            self.spec.max_episode_steps = batch.horizon
         self.render_mode = check_render_mode(render_mode)
         self._actions: np.ndarray | None = None
         super().__init__(batch.size, batch.observation_space, batch.action_space)

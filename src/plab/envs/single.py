@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike
 
 from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, info_of, make_batch
@@ -44,19 +42,6 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
         self.batch = make_batch(task, variant, **options)
         self.observation_space = self.batch.observation_space
         self.action_space = self.batch.action_space
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's specification; its ``max_episode_steps`` is ``sim.horizon``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = copy.copy(value)
-        if self._spec is not None:
-            self._spec.max_episode_steps = self.batch.horizon
-
-    _spec: EnvSpec | None = None
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None

@@ -116,7 +116,10 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
                 f"{name} has shape {numbers.shape}, but all bodies are of one material: give a body of the "
                 "scene one of its own"
             )
-        values[name] = np.broadcast_to(numbers if numbers.ndim > 1 else numbers.reshape(-1, 1), counts)
+        table = numbers if numbers.ndim > 1 else numbers.reshape(-1, 1)
+        if any(own not in (1, count) for own, count in zip(table.shape, counts, strict=True)):
+            raise SceneError(f"{name} has shape {numbers.shape}, but [environment, body] is {list(counts)}")
+        values[name] = np.broadcast_to(table, counts)
     changed = []
     for e, scene in enumerate(scenes):
         # A single material belongs to the scene, not to a body.

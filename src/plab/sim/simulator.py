@@ -141,7 +141,7 @@ class Simulator:
         self._drive: LinkMotion | None = None
         self._joints: Any = None
         self._initial_joints: np.ndarray | None = None
-        self._start_from(particles)
+        self._start_from(self._start_positions(self.scenes, particles))
         # Incremented by every change that affects the gradient of a rollout.
         self._version = 0
         self.changes = 0
@@ -155,6 +155,12 @@ class Simulator:
         engine = self._engine
         return held_bytes(self, engine, *engine.terms, self._particles, self._tape)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Refuse copying and pickling, with TypeError."""
+        raise TypeError(
+            "a simulator cannot be copied or pickled: build another, and set_state(state()) there"
+        )
+
     # -- settings -----------------------------------------------------------------------------------
 
     def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
@@ -165,6 +171,9 @@ class Simulator:
                 environment.
             softness: Decay rate of the soft model [1 / domain unit]; one value, or one per environment.
         """
+        for label, given in (("contact", model), ("softness", softness)):
+            if np.size(given) not in (1, self.batch):
+                raise ArgumentError(f"{label} has {np.size(given)} values for {self.batch} environments")
         models = np.broadcast_to(model, self.batch)
         decay = np.broadcast_to(np.asarray(softness, float), self.batch)
         for name, rate in zip(models, decay, strict=True):
@@ -203,16 +212,16 @@ class Simulator:
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
 
         Raises:
-            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+            SceneError: If a scene cannot be simulated or is of another kind.
+            ValueError: If positions are wrong. Nothing is changed in these cases.
         """
         self._require_runtime()
-        if len(scenes) != self.batch:
-            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
-        require_alike(scenes, self.scenes[0])
+        self._require_fitting(scenes)
+        positions = self._start_positions(scenes, particles)
         self.scenes = tuple(scenes)
         self.changes += 1
         self._engine.fill_parameters(scenes)
-        self._start_from(particles)
+        self._start_from(positions)
         self.reset()
 
     @property
@@ -281,7 +290,7 @@ class Simulator:
             ValueError: If positions have a wrong shape.
         """
         self._require_runtime()
-        require_alike(scenes, self.scenes[0])
+        self._require_fitting(scenes)
         held = {e: self._checked_particles(x) for e, x in particles.items()}
         self.scenes = tuple(scenes)
         self.changes += 1
@@ -735,11 +744,21 @@ class Simulator:
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
         return self._particles.unpack(bar.to_numpy(), poses, order)
 
-    def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
+    def _require_fitting(self, scenes: Sequence[Scene]) -> None:
+        if len(scenes) != self.batch:
+            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
+        require_alike(scenes, self.scenes[0])
+
+    def _start_positions(
+        self, scenes: Sequence[Scene], particles: Sequence[np.ndarray] | None
+    ) -> list[np.ndarray]:
+        """Return checked initial positions, sampled from the scenes if None are given."""
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
-        given = map(sample_particles, self.scenes) if particles is None else particles
-        positions = [self._checked_particles(x) for x in given]
+        given = map(sample_particles, scenes) if particles is None else particles
+        return [self._checked_particles(x) for x in given]
+
+    def _start_from(self, positions: Sequence[np.ndarray]) -> None:
         self._particles.start_order(positions)
         self._engine.fill_bodies(self.scenes, self._particles.initial)
         self._start_manipulators()
