@@ -68,7 +68,7 @@ def one_line(error: BaseException) -> str:
 
 
 def regular_file(path: Path) -> os.stat_result:
-    """Return the status of a regular file, because opening a pipe or a device could block.
+    """Return the status of a file, and reject folders, pipes and devices, because opening one could block.
 
     Raises:
         UnreadableError: If it is a folder, pipe or device.

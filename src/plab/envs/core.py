@@ -99,7 +99,7 @@ def compose_configs(
 
     Raises:
         ValueError: If numbers do not match, or overrides are not lists or set the task.
-        plab.config.ConfigError: If an override or a file does not fit.
+        plab.config.ConfigError: If an override or a file is invalid.
     """
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ArgumentError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")

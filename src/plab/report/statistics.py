@@ -32,9 +32,9 @@ class Summary:
     """Mean and spread of some numbers.
 
     Attributes:
-        mean: Their mean; NaN of none.
-        std: Population standard deviation, as in the paper's tables; NaN of none.
-        count: Their number.
+        mean: Mean; NaN without numbers.
+        std: Population standard deviation, as in the paper's tables; NaN without numbers.
+        count: Number of the numbers.
     """
 
     mean: float

@@ -156,8 +156,8 @@ class TrajectoryRunner(Runner):
 
 @dataclass
 class Finalist:
-    """Actions, shape [T, A], their iteration, loss and score there, and their score in the hard contact model
-    once that is known."""
+    """Actions, shape [T, A], with their iteration, loss and score, and their score in the hard contact model
+    after a check."""
 
     actions: np.ndarray
     iteration: int
