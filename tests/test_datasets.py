@@ -124,5 +124,5 @@ def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> N
     assert "cameras.yaml" in told([*again, "--cameras", str(tmp_path / "cameras.yaml")], main)
     with pytest.raises(ConfigError, match="observe_target"):
         run_config(cloned(written, "observe_target=false"), CACHE)
-    with pytest.raises(DatasetError, match="no dataset"):
+    with pytest.raises(DatasetError, match="not a dataset"):
         metadata_of(tmp_path)

@@ -254,7 +254,7 @@ def test_mistakes_in_a_model_are_named() -> None:
         ("task.kinematics.start={elbow: 3}", "joint elbow at 3 is outside its limits 0 .. 2.6"),
         ("task.kinematics.model=plab:none.xml", "there is no model"),
         ("task.kinematics.root=foot", "has no body 'foot'; choose from: base, upper"),
-        ("task.kinematics.sha256=abc", "another model than this configuration's"),
+        ("task.kinematics.sha256=abc", "differs from the model of this configuration"),
         ("task.kinematics.size=4", "more than a cell per substep"),
     ):
         with pytest.raises((ConfigError, SceneError), match=re.escape(named)):

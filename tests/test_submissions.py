@@ -158,10 +158,10 @@ def npy(array: np.ndarray, **options: Any) -> bytes:
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (b"\x93NUMPY\x01\x00rubbish", "no NumPy array"),
-        (npy(ACTIONS)[:-8], "no NumPy array"),
+        (b"\x93NUMPY\x01\x00rubbish", "not a NumPy array"),
+        (npy(ACTIONS)[:-8], "not a NumPy array"),
         # More than memory has, says the header.
-        (npy(np.zeros((10, 3))).replace(b"(10, 3)", b"(99, 9)"), "no NumPy array"),
+        (npy(np.zeros((10, 3))).replace(b"(10, 3)", b"(99, 9)"), "not a NumPy array"),
         (npy(ACTIONS * 1.1), "[-1, 1]"),
         (npy(ACTIONS * np.nan), "[-1, 1]"),
         (npy(np.array([[print]], object), allow_pickle=True), "NumPy"),

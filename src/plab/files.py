@@ -143,7 +143,7 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     known = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     if not known or info.file_size > min(LARGEST, max(_SMALL, _RATIO * info.compress_size)):
         raise UnreadableError(
-            f"{name!r}: {info.compress_size} bytes stand for {info.file_size}, as in no file that plab packs"
+            f"{name!r} would unpack from {info.compress_size} to {info.file_size} bytes, more than is allowed"
         )
     with _damage():
         return archive.read(info)
@@ -168,9 +168,9 @@ def _unpacked(path: Path, size: int, *_: int) -> bytes:
     with _damage():
         content = unpacker.decompress(path.read_bytes(), most)
     if not unpacker.eof and len(content) == most:
-        raise UnreadableError(f"{size} bytes stand for more than {most}: plab packs no such file")
+        raise UnreadableError(f"it would unpack from {size} to more than {most} bytes, more than is allowed")
     if not unpacker.eof or unpacker.unused_data:
-        raise ValueError("it is cut short, or something follows its end")
+        raise ValueError("it is truncated, or followed by other data")
     return content
 
 
@@ -212,9 +212,9 @@ def array_in(file: BinaryIO) -> np.ndarray:
         with _damage():
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)
     except ValueError as error:
-        raise UnreadableError(f"it holds no NumPy array of numbers or text ({error})") from error
+        raise UnreadableError(f"it is not a NumPy array of numbers or text ({error})") from error
     if array.dtype.kind not in "biufU":
-        raise UnreadableError(f"it holds {array.dtype}, neither numbers nor text")
+        raise UnreadableError(f"it contains {array.dtype}, neither numbers nor text")
     return array
 
 
@@ -241,8 +241,8 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
     found = next((place for place in places if os.path.exists(place)), None)
     if found is None:
         raise ShapeError(
-            f"there is no file {file}: put it there, into the working directory, into the config folder or "
-            "into the folder above it"
+            f"there is no file {file}: put it there, or into the working directory, the config folder or its "
+            "parent folder"
         )
     # Not resolved, because the target of a link may have another suffix.
     path = found.absolute()
@@ -254,7 +254,7 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
         raise ShapeError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if sha256 not in (None, digest):
         raise ShapeError(
-            f"{path} is another file than this configuration's: its SHA-256 begins with {digest[:8]}, not "
-            f"with {str(sha256)[:8]!r}; put that file back, or compose the configuration again"
+            f"{path} differs from the file of this configuration: its SHA-256 begins with {digest[:8]}, not "
+            f"with {str(sha256)[:8]!r}; restore the file, or compose the configuration again"
         )
     return str(path), digest

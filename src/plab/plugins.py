@@ -106,7 +106,7 @@ def _imported(text: str, name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         missing = str(error.name)
         if name == missing or name.startswith(f"{missing}."):
-            places = "in the config folder, the folder above it, the working directory or PYTHONPATH"
+            places = "in the config folder, its parent folder, the working directory or PYTHONPATH"
             raise ConfigError(f"'{text}': there is no module {missing} {places}") from None
         raise ConfigError(f"'{text}': module {name} needs {missing}, which is not installed") from None
     except SyntaxError as error:

@@ -153,7 +153,7 @@ def sources_and_words(
     words = [one for one in arguments if "=" in one and one[:8] != "results=" and not os.path.exists(one)]
     named = [one.removeprefix("results=") for one in arguments if one not in words]
     if not all(one.strip() for one in named):
-        raise ArgumentError("the name of a folder is empty: give one, or . for this one")
+        raise ArgumentError("the name of a folder is empty: name one, or . for the working directory")
     return [results_source(one) for one in named or ([default] if default else [])], words
 
 
@@ -168,14 +168,14 @@ def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     fitting = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
     one_protocol(row.config for row in fitting)
     if not fitting:
-        raise ResultsError(f"there is no finished run in {', '.join(map(str, sources))}: no run fits")
+        raise ResultsError(f"no finished run in {', '.join(map(str, sources))} matches the selection")
     return fitting
 
 
 def positive(text: str, least: int = 1) -> int:
     """Parse a positive integer."""
     if not text.isdecimal() or int(text) < least:
-        raise ArgumentTypeError(f"'{text}' is not a whole number from {least} on")
+        raise ArgumentTypeError(f"'{text}' must be a whole number of at least {least}")
     return int(text)
 
 
@@ -191,7 +191,7 @@ def task_list(text: str) -> list[str]:
 def folder(text: str) -> Path:
     """Parse the name of a folder, which must not be empty."""
     if not text.strip():
-        raise ArgumentTypeError("is empty: give the name of a folder, or . for this one")
+        raise ArgumentTypeError("is empty: name a folder, or . for the working directory")
     return Path(text).expanduser()
 
 

@@ -142,8 +142,8 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     for cfg in cfgs:
         if (actions := known_actions(cfg)) is None:
             raise ArgumentError(
-                f"no actions are known for {cfg.task.name}, variant {cfg.variant}: add a method that finds "
-                "some, such as method=adam"
+                f"{cfg.task.name}, variant {cfg.variant}, has no known actions: add a method that "
+                "finds them, such as method=adam"
             )
         found.append(Demonstration(cfg, actions, "demonstration"))
     return found

@@ -51,8 +51,8 @@ def main(argv: Sequence[str]) -> None:
     if runs.table.empty and options.what in ("notebooks", "html"):
         where = ", ".join(map(str, options.sources))
         raise ResultsError(
-            f"there are no finished runs to show in {where}: plab run task=Move makes one, "
-            "and results=example shows those that come with plab"
+            f"{where} has no finished runs: start one with plab run task=Move, or show the bundled runs with "
+            "results=example"
         )
     out = options.out or Path("reports") / options.what
     command = shlex.join(["plab", "report", *argv])

@@ -97,24 +97,23 @@ def parser() -> Parser:
 _USAGE = """\
 plab run [KEY=VALUE ...] [-m]
 
-Runs one task, variant, method and seed of PlasticineLab; writes one result file into results_dir.
-A run that was stopped goes on when the same command is given again; one that has finished is not
-repeated.
+Runs one task, variant, method and seed, and writes one result file into results_dir. Repeat the
+command to resume an interrupted run; finished runs are skipped.
 
 EXAMPLES
   plab run task=Rope method=adam seed=0
   plab run task=Move variant=3 method=gd method.lr=50
-  plab run sim.particles_scale=0.2 method.iterations=20        a quick try
-  plab run -m variant=1,2,3,4,5 seed=0,1,2                     fifteen runs that share a simulator
-  plab run -m task=Move method=sac,ppo method.episodes=2000    two methods that have the same key
-  plab run +experiment=yield_ablation                          a sweep that a file describes
+  plab run sim.particles_scale=0.2 method.iterations=20        a quick trial
+  plab run -m variant=1,2,3,4,5 seed=0,1,2                     fifteen runs in one simulator
+  plab run -m task=Move method=sac,ppo method.episodes=2000    a key of both methods
+  plab run +experiment=yield_ablation                          a sweep defined in a file
 """
 
 _MORE_EXAMPLES = """\
 MORE EXAMPLES
   plab run sim=reference sim.device=cuda                       float64 on the GPU
   plab run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
-  plab run -m variant=random 'seed_scene=range(10)'            ten drawn configurations
+  plab run -m variant=random 'seed_scene=range(10)'            ten random scenes
   plab run task=Torus method=ppo method.profile=paper          reinforcement learning
   plab run --config-dir mine task=Dumbbell                     the task of mine/task/Dumbbell.yaml
   plab run +experiment=smoke hydra/launcher=batch_joblib       in several processes
@@ -122,7 +121,7 @@ MORE EXAMPLES
 
 _FLAGS = """\
 FLAGS
-  -m, --multirun    run every combination of the values given with commas
+  -m, --multirun    run all combinations of comma-separated values
   --cfg job         print the configuration and stop; with --package sim, only that section
   --config-dir DIR  use the YAML files in DIR/task, DIR/method, DIR/sim and DIR/experiment, too
   -h, --help        this text
@@ -130,16 +129,16 @@ FLAGS
 """
 
 _KEYS = """\
-KEYS used often, with their defaults
-  variant=1                 of the task; random is drawn by seed_scene
-  seed=0                    random numbers of the method
-  method.iterations=200     updates of the actions
-  method.lr=0.1             step size
+FREQUENT KEYS, with their defaults
+  variant=1                 variant of the task; random: sampled with seed_scene
+  seed=0                    seed of the method
+  method.iterations=200     number of updates of the actions
+  method.lr=0.1             learning rate
   sim.device=cpu            cpu or cuda
-  sim.particles_scale=1.0   share of the particles, for quick tries
+  sim.particles_scale=1.0   factor on the number of particles, below 1 for quick trials
   results_dir=results       folder of the result files
-  force=false               begin again, and replace what is there
-  logger=none               tensorboard or wandb, too
+  force=false               true: recompute and replace an existing result
+  logger=none               none, tensorboard or wandb
 """
 
 _WIDTH = 100
@@ -159,7 +158,7 @@ def help_text(config_dir: str | None = None) -> str:
 def full_help_text(config_dir: str | None = None) -> str:
     """Return the text of ``--help-all``: ``--help``, more examples, and the commented YAML file of each
     choice, which has every key with its default."""
-    head = "FILES, whose keys are below the name of the group, such as method.lr"
+    head = "FILES; their keys are below the name of the group, such as method.lr"
     parts = [help_text(config_dir), _MORE_EXAMPLES, head]
     files = {"config": conf_folder() / "config.yaml"}
     for group in (*GROUPS, EXPERIMENT):

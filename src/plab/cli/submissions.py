@@ -56,7 +56,7 @@ def submit(argv: Sequence[str]) -> None:
     add = parser.add_argument
     what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
     add("sources", nargs="*", metavar="RESULTS | KEY=VALUE", help=what)
-    add("--card", type=Path, required=True, help="YAML file about the method")
+    add("--card", type=Path, required=True, help="YAML file that describes the method")
     add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
     add("--policy", type=_policy, action="append", default=[], help=what)
@@ -95,7 +95,7 @@ def _policy(text: str) -> tuple[str, Path]:
     task, _, name = text.partition("=")
     path = Path(name)
     if task not in suite_tasks() or path.suffix not in (".pt", ".onnx"):
-        raise ArgumentTypeError(f"'{text}' is not like Move=move.pt or Move=move.onnx")
+        raise ArgumentTypeError(f"'{text}' must have the form Move=move.pt or Move=move.onnx")
     return task, path
 
 
@@ -141,7 +141,7 @@ def verify(argv: Sequence[str]) -> int:
             tell(f"{path}: {why}")
         kept = write_verification(verdicts, submission, words)
         good = sum(one.outcome == HOLDS for one in verdicts)
-        print(f"{path}: {good} of {len(verdicts)} claim(s) hold; kept in {kept}")
+        print(f"{path}: {good} of {len(verdicts)} claim(s) hold; written to {kept}")
         codes.append(int(good < len(verdicts)))
     return max(codes)
 

@@ -118,7 +118,7 @@ def targets(argv: Sequence[str]) -> None:
         parser.error("--rebuild has no effect with targets.source: leave one of them out")
     table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])
     print_table(list(table.columns), table.itertuples(index=False, name=None))
-    print(f"simulated targets are kept in {cache_dir() / 'targets'}")
+    print(f"simulated targets are cached in {cache_dir() / 'targets'}")
     if options.csv is not None:
         options.csv.parent.mkdir(parents=True, exist_ok=True)
         table.drop(columns="seconds").to_csv(options.csv, index=False, float_format="%.6g")

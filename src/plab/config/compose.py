@@ -174,9 +174,7 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
         for path in (path for group in (*GROUPS, EXPERIMENT) for path in (folder / group).glob("*.yaml")):
             # Hydra would ignore it.
             if path.stem in choices(path.parent.name):
-                raise ConfigError(
-                    f"{path}: plab has a {path.parent.name} of this name, give the file another one"
-                )
+                raise ConfigError(f"{path}: plab has a {path.parent.name} of this name: rename the file")
         search_in(folder)
     for override in parse(words):
         key, text = override.key_or_group, str(override.input_line)
@@ -237,8 +235,8 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
 
     if drawing(load_config([f"task={name}", *own])).task != with_own_materials(cfg).task:
         raise ConfigError(
-            f"scenes of task {name} are drawn as its file has it: leave out what changes the task, or draw "
-            "none"
+            f"random scenes need the task {name} of its file: remove the overrides that change the task, or "
+            "the random scenes"
         )
     words = [[f"task={name}", "variant=random", f"seed_scene={int(seed)}"] for seed in seeds]
     drawn = [drawing(load_config(own)) for own in words]
@@ -305,7 +303,7 @@ def require_runnable(cfg: Config) -> None:
 def _typed_method(method: DictConfig, path: str) -> DictConfig:
     """Return a typed section ``method``."""
     if not isinstance(method, DictConfig) or "family" not in method:
-        raise ConfigError(f"{path}.family has no value: name the family, or its module:NAME")
+        raise ConfigError(f"{path}.family is missing: set it to the name of a family, or to module:NAME")
     if isinstance(stages := method.get("stages"), DictConfig):
         for name in stages:
             stages[name] = _typed_method(stages[name], f"{path}.stages.{name!s}")

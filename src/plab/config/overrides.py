@@ -72,7 +72,7 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
     from ``names``. Raise ConfigError if there are no values."""
     value = override.value()
     if isinstance(value, IntervalSweep):
-        raise ConfigError(f"'{override.input_line}': an interval has no values to run: use range")
+        raise ConfigError(f"'{override.input_line}': an interval is not a list of values: use range")
     if isinstance(value, Glob):
         found = value.filter(list(names))
         # glob(*) is the suite; glob(Hand*) selects extension tasks.
@@ -85,7 +85,7 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
     else:
         found = [override.get_value_element_as_str()]
     if not found:
-        raise ConfigError(f"'{override.input_line}' gives no value: there is nothing to run")
+        raise ConfigError(f"'{override.input_line}' has no values")
     return found
 
 

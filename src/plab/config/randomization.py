@@ -101,7 +101,7 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
     fixed = group == "bodies" and rest[-1] in _FIXED
     if fixed or isinstance(node, bool) or np.asarray(node).dtype.kind not in "iuf":
         advice = "; use offset" if rest[-1:] == ["center"] else ""
-        raise ConfigError(f"{path}: task.{key} cannot be drawn{advice}")
+        raise ConfigError(f"{path}: task.{key} cannot be randomised{advice}")
     return node
 
 
@@ -188,7 +188,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     ConfigError if the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid."""
     if not task.random:
         raise ConfigError(
-            f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"
+            f"task {task.name} has no section 'random'; choose a variant from: {', '.join(task.variants)}"
         )
     if seed_scene is None or seed_scene < 0:
         raise ConfigError(f"seed_scene must be an integer of at least 0, not {seed_scene}")
@@ -215,7 +215,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
             continue
         return changes
     raise ConfigError(
-        f"task {task.name}: none of {ATTEMPTS} draws with seed_scene={seed_scene} is valid; the last: {flaw}"
+        f"task {task.name}: all {ATTEMPTS} samples with seed_scene={seed_scene} are invalid; the last: {flaw}"
     )
 
 

@@ -191,7 +191,7 @@ class KinematicsConfig(ranges.Section):
         chain, digest = read_model(self.model, self.root, self.size, self.omit)
         if self.sha256 not in (None, digest):
             raise ModelError(
-                f"{self.model} is another model than this configuration's: its SHA-256 begins with "
+                f"{self.model} differs from the model of this configuration: its SHA-256 begins with "
                 f"{digest[:8]}, not with {str(self.sha256)[:8]!r}"
             )
         self.sha256 = digest

@@ -88,7 +88,7 @@ def write_dataset(
                 attributes.append(episode.attributes)
                 steps += length
         if not attributes:
-            raise DatasetError(f"{name}: no episode is left to write")
+            raise DatasetError(f"{name}: there are no episodes to write")
         metadata = {
             "dataset_id": name,
             "minari_version": VERSION,
@@ -138,7 +138,7 @@ def metadata_of(path: str | Path) -> dict[str, Any]:
                 return json.loads(file.read_text(encoding="utf-8")) | {"path": place}
             except ValueError as error:
                 raise DatasetError(f"{file} cannot be read: {error}") from error
-    raise DatasetError(f"{path} is no dataset: it has no data/metadata.json; plab dataset writes one")
+    raise DatasetError(f"{path} is not a dataset: it has no data/metadata.json; write one with plab dataset")
 
 
 def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episode]:

@@ -109,7 +109,7 @@ def compose_configs(
     for entries in (overrides, *own):
         if own_task := [word for word in prepared(entries) if word.partition("=")[0] == "task"]:
             raise ArgumentError(
-                f"'{own_task[0]}' in an environment of task {task}: make that task's environment"
+                f"'{own_task[0]}' has no effect on an environment of task {task}: create one of that task"
             )
     lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
@@ -334,7 +334,7 @@ class EpisodeBatch:
     def problem(self) -> Problem:
         """Scenes, targets and simulator of the batch; raises RuntimeError if the environment is closed."""
         if self._problem is None:
-            raise RuntimeError("the environment is closed: make a new one")
+            raise RuntimeError("the environment is closed: create a new one")
         return self._problem
 
     @property

@@ -27,7 +27,7 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):
-            raise ArgumentError('observe must hold "state", "mass" and "target_mass"')
+            raise ArgumentError('observe must contain "state", "mass" and "target_mass"')
         goals: Any = Dict({name: space.spaces[own] for name, own in _NAMES.items()})
         self.observation_space = goals
 

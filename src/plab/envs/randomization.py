@@ -175,7 +175,7 @@ class EpisodeRandomizer:
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
-                raise ArgumentError("this target is made once: draw among task.randomize.scenes")
+                raise ArgumentError("this target cannot be randomised: use task.randomize.scenes")
             return base.target
         with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
@@ -223,7 +223,7 @@ def staged(cfg: Config) -> bool:
     """Return True if the task has stages before its target; raise ConfigError if targets are randomised,
     too."""
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
-        raise ConfigError("task.randomize cannot draw scenes or targets of a task with task.stages")
+        raise ConfigError("task.randomize cannot have scenes or targets in a task with task.stages")
     return bool(cfg.task.stages)
 
 

@@ -141,7 +141,9 @@ class PlabVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Raise AttributeError, because there are no separate environment objects."""
-        raise AttributeError(f"sub-environments have no methods of their own, and no '{method_name}'")
+        raise AttributeError(
+            f"sub-environments are not separate objects with methods such as '{method_name}'"
+        )
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None

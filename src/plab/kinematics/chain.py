@@ -215,7 +215,7 @@ class Chain:
             joints[k] = replace(joint, low=low, high=high, start=at, scale=scales.get(joint.name, 0.0))
         components = list(dict.fromkeys(shared.get(one.name, one.name) for one in joints if one.scale))
         if not components:
-            raise ModelError("scale: no joint moves: give one at least a scale")
+            raise ModelError("scale: no joint moves: set the scale of at least one joint")
         numbered = [
             replace(one, component=components.index(shared.get(one.name, one.name)) if one.scale else 0)
             for one in joints

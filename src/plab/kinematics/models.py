@@ -94,7 +94,7 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 continue
             if kind == mujoco.mjtJoint.mjJNT_BALL:
-                raise ModelError(f"{path}: joint {name} is a ball: use three hinges")
+                raise ModelError(f"{path}: joint {name} is a ball joint: use three hinges")
             hinge, rest = bool(kind == mujoco.mjtJoint.mjJNT_HINGE), m.qpos0[m.jnt_qposadr[k]]
             unit = 1.0 if hinge else size
             low, high = unit * (m.jnt_range[k] - rest) if m.jnt_limited[k] else (-np.inf, np.inf)

@@ -44,7 +44,7 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
             continue
         kind = load_object(path, type)
         if not issubclass(kind, Term):
-            raise ConfigError(f"method.loss_terms.{name}: '{path}' is no term of plab.losses.term")
+            raise ConfigError(f"method.loss_terms.{name}: '{path}' is not a term of plab.losses.term")
         term = kind()
         term.name, term.weight = name, float(weights[name])
         terms.append(term)

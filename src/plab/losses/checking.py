@@ -69,9 +69,7 @@ def check_gradient(
             slopes.setdefault(part, []).append(pair)
     largest = max(abs(slope) for pairs in slopes.values() for pair in pairs for slope in pair)
     if largest == 0.0:
-        raise ArgumentError(
-            f"{type(term).__name__} does not change with the state: there is no gradient to check"
-        )
+        raise ArgumentError(f"{type(term).__name__} does not depend on the state: it has no gradient")
     errors = {}
     for part, pairs in slopes.items():
         # Differences of irrelevant parts are rounding errors.

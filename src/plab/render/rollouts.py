@@ -59,7 +59,7 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     """As :func:`stored`, but on the CPU if this computer has no CUDA device."""
     cfg, actions = stored(path)
     if cfg.sim.device == "cuda" and not cuda_devices():
-        print_once("the run used CUDA, which this computer has not: replaying it on the CPU")
+        print_once("the run used CUDA, which is not available: replaying it on the CPU")
         cfg.sim.device = "cpu"
     return cfg, actions
 
@@ -110,7 +110,7 @@ def demonstration(cfg: Config) -> np.ndarray:
     scene, actions = build_scene(cfg), known_actions(cfg)
     which = f"demonstration of {cfg.task.name}, variant {cfg.variant},"
     if actions is None:
-        print_once(f"no {which} is known: the manipulators stay put")
+        print_once(f"there is no {which} so the manipulators do not move")
         return np.zeros((scene.horizon, scene.action_dim))
     if (count := actions.shape[1]) != scene.action_dim:
         raise RenderError(f"the {which} has {count} action components, this scene takes {scene.action_dim}")
@@ -135,7 +135,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
         scenes = build_scenes([cfg])
         return _recording(cfg, scenes[0], make_simulator(cfg, scenes), None, actions, motion=True)
     if cfg.targets.source is not None:
-        print_once(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
+        print_once(f"the output contains your target file, of {cfg.targets.source}: check its licence")
     return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions, motion=True)
 
 

@@ -123,11 +123,11 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
     columns = None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
     counts = {
-        "are not finished, hence not in them": len(inside) - len(complete),
-        "are of other tasks, variants, methods or seeds, hence not in them": (
+        "left out: not finished": len(inside) - len(complete),
+        "left out: other tasks, variants, methods or seeds": (
             sum(row.values["status"] == "finished" for row in fitting) - len(complete)
         ),
-        "try other settings than conf/ has, hence are not in them": len(complete) - len(finished),
+        "left out: settings that differ from conf/": len(complete) - len(finished),
     }
     left_out = [f"{count} run(s) {what}" for what, count in counts.items() if count]
     return Runs(
@@ -166,8 +166,8 @@ def _split(
             new[name, value] = part(name, key.rpartition(".")[2], str(value), len(new))
     if not new:
         raise ArgumentError(
-            f"no method has runs that differ in {key}: split by a key in which they do, such as method.lr, "
-            "or by folder or seed"
+            f"no method has runs that differ in {key}: split by another key, such as method.lr, or by folder "
+            "or seed"
         )
     renamed = [
         replace(row, values=row.values | {"method": new.get(pair, pair[0])})
@@ -208,7 +208,7 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
             if key not in _IGNORED_KEYS:
                 texts = " and ".join(map(str, values))
                 advice = f"choose one, for example {key}={values[0]}"
-                raise MixedRunsError(f"runs of {' '.join(names)} differ in {key}, which is {texts}: {advice}")
+                raise MixedRunsError(f"runs of {' '.join(names)} differ in {key} ({texts}): {advice}")
 
 
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:

@@ -133,7 +133,7 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
 def rewards(runs: Runs, series: Series) -> list[Drawing]:
     """Return reward against episodes, per task and per configuration, all methods on one axis."""
     notes = [
-        "Reward of an episode (sum over its steps) against episodes simulated so far, its own included.",
+        "Reward of an episode (sum over its steps) against episodes simulated so far, including its own.",
         "Lines: mean over the runs; shaded: one standard deviation.",
         "Values below zero count as zero, as in the paper.",
         *settings_note(runs),
@@ -226,7 +226,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
         best = demonstration_scores().groupby("task")["score"].mean().reindex(tasks)
         line: dict[str, Any] = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
         panel.scatter(places, best, label="best known actions", **line)
-        notes.append("Black: mean over the variants of what the reference demonstrations reach.")
+        notes.append("Black: score of the reference demonstrations, mean over the variants.")
     panel.set_xticks(places, tasks, rotation=20, ha="right")
     panel.set(ylim=(0.0, 1.08), ylabel="normalised incremental IoU")
     legend(figure)

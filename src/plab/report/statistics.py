@@ -164,13 +164,13 @@ def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
         if name in scores and name not in strata
     ]
     notes = [
-        f"Over the {len(keys)} configurations of which every method shown has runs; runs per method: "
+        f"Over the {len(keys)} configurations with runs of all methods shown; runs per method: "
         f"{', '.join(counts)}.",
-        *([f"Not shown, for they lack runs of these configurations: {', '.join(apart)}."] if apart else []),
+        *([f"Not shown, for lack of runs of these configurations: {', '.join(apart)}."] if apart else []),
         f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
     ]
     if any(len(scores) < 2 for own in strata.values() for scores in own):
-        notes.append("Configurations with a single run count as if others would give the same.")
+        notes.append("Intervals do not include the spread of configurations with a single run.")
     return strata, notes
 
 

@@ -99,12 +99,11 @@ def mean_and_std(summary: Summary, decimals: int = 2) -> str:
     return mean if summary.count < 2 else f"{mean} ± {number(summary.std, decimals)}"
 
 
-_INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
+_INCOMPLETE = "A cell with fewer runs than expected shows their number; it and its competitors are not bold."
 _BOLD = "Bold: best RL method and best gradient method."
 _DIFFERENCE = (
-    "Difference: ours minus the paper's, mean over the variants that have runs, with the "
-    f"{CONFIDENCE:.0%} interval of Welch's t, its variance estimated within variants on both sides; no "
-    "interval where a variant has one run."
+    "Difference: ours minus the paper's, mean over the variants with runs, with Welch's "
+    f"{CONFIDENCE:.0%} interval from the variances within variants; no interval if a variant has one run."
 )
 DISTANCES = {"chamfer": "Chamfer", "earth_movers": "earth mover's"}
 """Headings of distances by their columns in results."""
@@ -322,8 +321,8 @@ def agreement(runs: Runs) -> list[Table]:
         }
     )
     notes = [
-        "Mean scores of the configurations that both have. Correlation: Pearson's. Distance: of the means, "
-        f"without sign; difference: ours minus the paper's. Agree: {AGREES}."
+        "Mean scores of common configurations. Correlation: Pearson's. Distance: absolute difference of the "
+        f"means; difference: ours minus the paper's. Agree: {AGREES}."
     ]
     return [Table("agreement", "comparison", "Agreement with the paper's table", shown, data, notes=notes)]
 
@@ -378,8 +377,8 @@ def solvability(runs: Runs) -> list[Table]:
     data[["difference", "low", "high"]] = [(gap.value, gap.low, gap.high) for gap in gaps]
     notes = [
         "Normalised incremental IoU of the best known actions, replayed in the hard contact model.",
-        "Our targets are made from their parameters or by scripts, the paper's are files, so the two columns "
-        "judge somewhat different goals. The interval is Student's t over the paper's seeds.",
+        "Our targets are generated from parameters or scripts, the paper's are files, so the goals of "
+        "the two columns differ slightly. The interval is Student's t over the paper's seeds.",
     ]
     title = "Demonstrations beside the best method of the paper"
     return [Table("solvability", "comparison", title, cells, data, None, notes, True)]
@@ -413,12 +412,12 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
     shown = pd.DataFrame(cells, columns=columns)
     data = pd.DataFrame(rows, columns=["task", "method", "runs", "steps", "score", "low", "high", "seconds"])
     notes = [
-        "Score of the best actions found within a budget of simulated environment steps, those with a "
-        "gradient counted like those without. Rows of planners and RL methods are of the hard contact model, "
-        "those of gradient methods of that of their rollouts.",
-        f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t, its variance estimated over the "
-        "seeds of each variant: none where a variant has one run.",
-        "A run that has ended keeps its score. A method has no score before all of its runs have a row.",
+        "Score of the best actions found within a budget of simulated environment steps; steps with and "
+        "without gradient count equally. Planners and RL methods are evaluated in the hard contact model, "
+        "gradient methods in that of their rollouts.",
+        f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t from the variances within "
+        "variants, none if a variant has one run.",
+        "A finished run keeps its score. A method has a score once all of its runs have a row.",
         *settings_note(runs),
     ]
     return [Table("score_at_budget", "ours", "Score at equal budgets", shown, data, notes=notes, long=True)]
@@ -427,12 +426,12 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
 # ----------------------------------------------------------------------------------------------------- timing
 
 _TIMES = [
-    "Milliseconds per environment step of one environment, mean ± standard deviation (in brackets: how many "
-    "measurements). Runs measure themselves, without building and compiling; runs computed in one batch, of "
-    "which each has its share, count once. Forward + backward: also measures and update. RL: simulation, "
+    "Milliseconds per environment step of one environment, mean ± standard deviation (in brackets: number "
+    "of measurements). Times of runs exclude building and compiling; the runs of a batch share its time and "
+    "count as one measurement. Forward + backward includes measures and update; RL includes simulation, "
     "loss and learning, without evaluations.",
-    "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
-    "measurements, for the paper gives no spread.",
+    "The paper used a GTX 1080 Ti. The interval is Student's t over our measurements, because the paper "
+    "gives no spread.",
 ]
 
 
@@ -532,9 +531,9 @@ def hyperparameters() -> list[Table]:
     bold = np.zeros(shown.shape, dtype=bool)
     bold[:, 2:] = ((data["plab"] != data["paper"]) & data["paper"].ne("")).to_numpy()[:, None]
     notes = [
-        "plab: conf/method/, profile release, the authors' code. Paper: profile paper, as far as it is "
-        "printed; of gradient methods the authors' code, and the paper's decay rate of the soft contact.",
-        "Bold: not the same. A dash: not printed.",
+        "plab: conf/method/, profile release (the authors' code). Paper: profile paper, as printed; for "
+        "gradient methods the authors' code, and the paper's decay rate of the soft contact.",
+        "Bold: different. Dash: not printed.",
     ]
     title = "Hyper-parameters, compared"
     return [Table("hyperparameters", "comparison", title, shown, data, bold, notes, True)]

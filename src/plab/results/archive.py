@@ -62,7 +62,7 @@ def pack(
                 raise ResultsError(f"{row.path} and {other.path} are runs of one configuration: remove one")
     if not packed:
         raise ResultsError(
-            "there is nothing to pack: no run fits" + (f"; {unreadable[0]}" if unreadable else "")
+            "there is nothing to pack: no run matches" + (f"; {unreadable[0]}" if unreadable else "")
         )
     members = []
     for name, row in sorted(packed.items()):

@@ -153,7 +153,7 @@ def stored_config(text: str) -> dict[str, Any]:
     config = json.loads(text)
     for key in ("task.name", "variant", "method.name"):
         if not _NAME.fullmatch(name := str(lookup(config, key))):
-            raise ValueError(f"{key} in config is no name: {name!r:.80}")
+            raise ValueError(f"{key} in config is not a valid name: {name!r:.80}")
     return config
 
 
@@ -327,7 +327,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     archive, member = inside
     with opened_archive(archive) as members:
         if member not in members.NameToInfo:
-            raise ResultsError(f"{archive} holds no run {member}")
+            raise ResultsError(f"{archive} has no run {member}")
         with opened_member(members, member, path) as file:
             yield file
 
@@ -409,7 +409,7 @@ def _numbers(file: h5py.Group, path: str) -> np.ndarray:
     plist, info = found.get_create_plist(), h5py.h5o.get_info
     linked = info(found).fileno != info(file.id).fileno or plist.get_external_count()
     if linked or found.dtype.kind not in "biufc" or plist.get_layout() == h5py.h5d.VIRTUAL:
-        raise ValueError(f"{path} holds no numbers, or has them in another file")
+        raise ValueError(f"{path} must contain numbers, in the same file")
     size = math.prod(found.shape) * found.dtype.itemsize
     if size > min(LARGEST, _SMALL + _RATIO * found.get_storage_size()):
         raise ValueError(f"{path} claims {size} bytes, which the file does not hold")

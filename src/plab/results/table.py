@@ -200,7 +200,7 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
             yield root, root.stat()
         except OSError as error:
             why = "does not exist" if not os.path.lexists(root) else f"cannot be read ({error.strerror})"
-            raise ResultsError(f"there are no results: {root} {why}") from None
+            raise ResultsError(f"no results: {root} {why}") from None
         return
     closed: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
@@ -408,7 +408,7 @@ def query(
     except duckdb.Error as error:
         # Without hints and the marked position in the query.
         first = " ".join(str(error).partition("\n")[0].split())
-        raise ArgumentError(f"{first}; there are the tables {', '.join(_TABLES)}") from None
+        raise ArgumentError(f"{first}; the tables are {', '.join(_TABLES)}") from None
 
 
 def scores(

@@ -113,7 +113,7 @@ def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -
                 own = family(name)
                 kind = own.runner_type()
                 if not issubclass(kind, Runner):
-                    raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
+                    raise ConfigError(f"the runner of method.family '{name}' is not a plab.runners.Runner")
                 # Executed alone, all together, or with those at the same iteration.
                 groups: dict[int, list[Track]] = defaultdict(list)
                 for number, track in enumerate(party):

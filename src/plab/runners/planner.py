@@ -214,12 +214,12 @@ class StagesConfig(MethodConfig):
         for name, stage in self.stages.items():
             if not isinstance(stage, PlannerConfig):
                 raise ConfigError(
-                    f"{path}.stages.{name} is no planner: start from one, as conf/method/solve.yaml"
+                    f"{path}.stages.{name} is not a planner: start from one, as in conf/method/solve.yaml"
                 )
             for part in ("loss_weights", "loss_terms"):
                 if getattr(stage, part) != getattr(self, part):
                     raise ConfigError(
-                        f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
+                        f"{path}.stages.{name}.{part} differs from {path}.{part}: stages share one loss"
                     )
 
 

@@ -199,11 +199,11 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         policy = _policy(path)
     except FileNotFoundError:
         why = "sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
-        raise ResultsError(f"{path} is not there: {why}") from None
+        raise ResultsError(f"{path} does not exist: {why}") from None
     except ResultsError:
         raise
     except Exception as error:
-        why = f"is no policy of plab's ({one_line(error)}): run it again with force=true"
+        why = f"is not a policy of plab ({one_line(error)}): run it again with force=true"
         raise ResultsError(f"{path} {why}") from error
     # Errors of the device do not concern the file.
     policy.network = policy.network.to(device)
@@ -226,7 +226,7 @@ def _policy(path: Path) -> Policy:
     widths = [spaces.sizes[0], *method.hidden, spaces.sizes[1]]
     needed = sum(map(math.prod, itertools.pairwise(widths)))
     if needed > (there := sum(values.numel() for values in parameters.values())):
-        raise ValueError(f"it has {there} parameters, its networks at least {needed}")
+        raise ValueError(f"it has {there} parameters, but its networks have at least {needed}")
     network = first_policy(method, spaces)
     network.load_state_dict(parameters)
     return Policy(network, arrays.get("mean"), arrays.get("variance"))

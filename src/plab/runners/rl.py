@@ -65,8 +65,8 @@ class RlRunner(PolicyRunner):
             room = 0.9e-9 * torch.cuda.mem_get_info()[0] if cuda else max(cfgs[0].sim.memory_mb / 1e3, each)
             if len(cfgs) * each > room:
                 raise RunError(
-                    f"no room for {len(cfgs)} replay buffers of {each:.1f} GB: {room:.1f} GB are free; set a "
-                    "smaller method.buffer_size or method.torch_device=cpu"
+                    f"{len(cfgs)} replay buffers of {each:.1f} GB do not fit into {room:.1f} GB: set a "
+                    "smaller method.buffer_size, or method.torch_device=cpu"
                 )
         size = len(cfgs) if cuda else 1
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]

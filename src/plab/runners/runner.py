@@ -579,7 +579,7 @@ class RunLog:
             self._write({name: float(value) for name, value in values.items() if math.isfinite(value)}, steps)
         except (OSError, RuntimeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise ResultsError(f"logger={self._cfg.logger} fails: {reason}; logger=none goes on") from error
+            raise ResultsError(f"logger={self._cfg.logger}: {reason}; continue with logger=none") from error
 
     def close(self) -> None:
         """End the log."""

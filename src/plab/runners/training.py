@@ -250,7 +250,7 @@ class PolicyRunner(Runner, ABC):
         training = [one for cfg in cfgs for one in self.environments(cfg)]
         if self.method.torch_device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
-                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
+                "method.torch_device=cuda: PyTorch has no CUDA device; choose method.torch_device=cpu"
             )
         kinds = [(training, self.method.contact)] if training else []
         *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))

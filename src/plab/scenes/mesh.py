@@ -102,7 +102,7 @@ class Mesh:
         if not surface.is_watertight:
             raise ShapeError(f"{file} is not watertight: close its holes, so that each edge has two faces")
         if not surface.is_winding_consistent:
-            raise ShapeError(f"{file} has neighbouring faces that look to different sides: unify its normals")
+            raise ShapeError(f"{file} has neighbouring faces of opposite orientation: unify its normals")
         (low, high), volume = surface.bounds, abs(float(surface.volume))
         longest = float((high - low).max())
         self.extent, self.volume = (high - low) / longest, volume / longest**3
@@ -187,6 +187,6 @@ class Mesh:
         # Four standard deviations of the count, plus a tolerance for harmless overlaps.
         if abs(share - expected) > 0.02 * expected + 4 * np.sqrt(expected / _TRIED):
             raise ShapeError(
-                f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
-                "parts that overlap, and let all faces look outwards"
+                f"{file} encloses {share / expected:.2f} times the volume computed from its faces: unite "
+                "overlapping parts, and orient all faces outwards"
             )

@@ -43,7 +43,7 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
     first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
     for number, scene in enumerate(scenes):
         if not isinstance(scene, Scene):
-            raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
+            raise SceneError(f"scenes must be results of build_scene(), not {scene!r}")
         scene.validate()
         for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
             if own != other:
@@ -113,8 +113,8 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
         numbers = np.asarray(value, float)
         if numbers.ndim > 1 and scenes[0].material_count == 1:
             raise SceneError(
-                f"{name} has shape {numbers.shape}, but all bodies are of one material: give a body of the "
-                "scene one of its own"
+                f"{name} has shape {numbers.shape}, but all bodies share one material: give a body of the "
+                "scene its own"
             )
         table = numbers if numbers.ndim > 1 else numbers.reshape(-1, 1)
         if any(own not in (1, count) for own, count in zip(table.shape, counts, strict=True)):

@@ -56,16 +56,16 @@ def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None
     count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
     numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
     if not numbered:
-        raise SceneError(f"a grid of {n}^3 nodes has more nodes than the simulator can number: use fewer")
+        raise SceneError(f"a grid of {n}^3 nodes exceeds the range of indices: use fewer nodes")
     if one > room:
         raise SceneError(
-            f"the scene needs at least {one / 1e9:.3g} GB, and there are {room / 1e9:.3g} GB: "
+            f"the scene needs at least {one / 1e9:.3g} GB, but only {room / 1e9:.3g} GB are available: "
             "use fewer particles, grid nodes or substeps"
         )
     if count > numbered or count * one > room:
         raise SceneError(
-            f"{count} environments of {n}^3 nodes need at least {count * one / 1e9:.3g} GB, and there are "
-            f"{room / 1e9:.3g} GB: simulate at most {min(numbered, int(room // one))} together"
+            f"{count} environments of {n}^3 nodes need at least {count * one / 1e9:.3g} GB, but only "
+            f"{room / 1e9:.3g} GB are available: simulate at most {min(numbered, int(room // one))} together"
         )
 
 

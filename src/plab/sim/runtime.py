@@ -114,7 +114,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     _refuse_fork()
     # Taichi can create fields only in the thread that initialised it, and aborts in others.
     if _thread not in (None, threading.get_ident()):
-        raise RuntimeError("make all environments and simulators in one thread: Taichi is started in another")
+        raise RuntimeError("create all environments and simulators in one thread, that of the first")
     _thread = threading.get_ident()
     if device not in DEVICES:
         raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")

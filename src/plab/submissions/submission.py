@@ -108,7 +108,7 @@ def configuration_of(cfg: Config) -> Configuration:
     if not own or cfg.targets.source is not None or cfg.variant not in VARIANTS:
         seeds = f"seed_scene={UNSEEN[0].removeprefix('random')} to {UNSEEN[-1].removeprefix('random')}"
         raise SubmissionError(
-            f"{cfg.task.name}-v{cfg.variant} is no configuration of the leaderboard: those have "
+            f"{cfg.task.name}-v{cfg.variant} is not a configuration of the leaderboard, which has "
             f"protocol=plab, plab's own targets, and the variants 1 to 5, or variant=random with {seeds}"
         )
     return Configuration(cfg.task.name, cfg.variant)

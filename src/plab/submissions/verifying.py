@@ -176,7 +176,7 @@ def play(
                 given = f"{name} gives actions of {actions.shape[1]} components"
                 raise SubmissionError(f"{given}, its task takes {components}")
             if not np.array_equal(actions, actor(observations)):
-                raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
+                raise SubmissionError(f"{name} is not deterministic: actions for one observation differ")
         else:
             plans, shape = actor[start : start + _BATCH], (batch.horizon, components)
             for cfg, plan in zip(some, plans, strict=True):
@@ -216,7 +216,7 @@ def load_policy(name: str, content: bytes) -> Policy:
         except Exception as error:
             raise SubmissionError(f"{name} cannot be run ({_reason(error)})") from None
         if actions.ndim != 2 or len(actions) != len(observations) or not np.isfinite(actions).all():
-            raise SubmissionError(f"{name} must give finite actions of shape [batch, action]")
+            raise SubmissionError(f"{name} must return finite actions of shape [batch, action]")
         return np.clip(actions, -1.0, 1.0)
 
     return answer
@@ -432,7 +432,7 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
                     raise SubmissionError(f"{both}: submit one training of each")
             entries += own
     if not entries:
-        raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
+        raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run matches")
     return sorted(entries, key=lambda entry: entry.configuration)
 
 

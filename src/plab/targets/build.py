@@ -228,7 +228,9 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
             raise UnreadableError(f"has negative masses, {negative:.3g} particle masses in all, {most}")
         expected = (scene.particle_count, RELEASE_PARTICLES)
         if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
-            raise UnreadableError(f"holds {total:.0f} particle masses, not {' or '.join(map(str, expected))}")
+            raise UnreadableError(
+                f"has the mass of {total:.0f} particles, not {' or '.join(map(str, expected))}"
+            )
     except FileNotFoundError:
         reason = "does not exist; name the files like Move3D-v1.npy"
         raise TargetError(f"targets.source: {path} {reason}") from None

@@ -395,7 +395,7 @@ class GestureTarget(Script):
                 at[name] = min(max(moved, joint.low), joint.high)
         if len(rows) > EPISODE_STEPS:
             raise TargetError(
-                f"the gesture takes {len(rows)} steps, not at most {EPISODE_STEPS}: shorten its ways"
+                f"the gesture takes {len(rows)} steps, more than {EPISODE_STEPS}: shorten its motions"
             )
         return np.pad(rows, ((0, EPISODE_STEPS - len(rows)), (0, 0)))
 
