@@ -59,7 +59,7 @@ def tell(message: str) -> None:
 
 def out_of_memory(error: MemoryError) -> str:
     """Return a one-line message about insufficient memory; Python's own error is empty."""
-    return str(error) or "this computer has too little memory for that: close something, or ask for less"
+    return str(error) or "out of memory: close other programs, or use fewer particles or environments"
 
 
 def traceback_wanted() -> bool:

@@ -261,7 +261,7 @@ def main(argv: Sequence[str]) -> None:
         action="store_true",
         help="coarser, fewer settings, 1000 particles instead of 10000, 20 steps",
     )
-    text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"
+    text = f"tasks, comma-separated (all; {','.join(QUICK_TASKS)} with --quick)"
     add("--task", type=task_list, help=text)
     add("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
     add("--output", type=folder, default=Path("accuracy"), help="folder to write to")

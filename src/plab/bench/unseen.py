@@ -116,9 +116,9 @@ def main(argv: Sequence[str]) -> None:
     options = parser.parse_intermixed_args(argv)
     paths, words = sources_and_words(options.what, default=None)
     if bool(paths) == bool(options.policy):
-        parser.error("name result files of runs that have trained a policy, or --policy MODULE:NAME")
+        parser.error("name result files of runs with a trained policy, or --policy MODULE:NAME")
     if options.scenes < 2:
-        parser.error("--scenes has to be at least 2: one score has no interval")
+        parser.error("--scenes must be at least 2: one score has no interval")
     policies: dict[str, tuple[Policy, Sequence[str], str]] = {str(path): _trained(path) for path in paths}
     if options.policy:
         function: Any = load_object(options.policy, cast(Any, Callable))

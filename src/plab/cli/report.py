@@ -34,16 +34,16 @@ def main(argv: Sequence[str]) -> None:
     parser = Parser("plab report", __doc__)
     add = parser.add_argument
     add("what", choices=("tables", "curves", "notebooks", "html"), help="kind of report")
-    add_sources(parser, "runs to take, e.g. task=Rope,Move seed=0,1,2")
+    add_sources(parser, "runs to select, such as task=Rope,Move seed=0,1,2")
     add("--out", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by plab bench speed --paper --csv, for the table of times"
     add("--speed", type=Path, help=what)
-    what = "notebooks: folder of speed.csv and accuracy.csv; example: those that come with plab (default: "
-    what += "reports/bench; example where the results come with plab)"
+    what = "notebooks: folder of speed.csv and accuracy.csv; example: the bundled ones (default: "
+    what += "reports/bench; example for bundled results)"
     add("--bench", type=measurements, help=what)
-    what = "html: draw no pictures, which takes minutes; those that are there stay"
+    what = "html: render no pictures, which takes minutes; existing ones are kept"
     add("--no-pictures", dest="pictures", action="store_false", help=what)
-    what = "key whose values are put side by side as if they were methods: method.lr, or folder, or seed"
+    what = "key whose values are treated as separate methods: method.lr, folder or seed"
     add("--split", default="", metavar="KEY", help=what)
     options = parser.parse_intermixed_args(argv)
     options.sources, options.words = sources_and_words(options.sources)

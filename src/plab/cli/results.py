@@ -52,8 +52,8 @@ def main(argv: Sequence[str]) -> int | None:
 def _scores(argv: Sequence[str]) -> None:
     """Print runs with their scores, a line each."""
     parser = Parser("plab results scores", _scores.__doc__)
-    add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default those finished")
-    what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
+    add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default the finished ones")
+    what = "additional columns, comma-separated: keys such as method.lr, or columns of plab.results.load"
     parser.add_argument("--keys", type=_names, default=[], help=what)
     parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, separated by commas")
     parser.add_argument("--descending", action="store_true", help="sort in descending order")
@@ -100,9 +100,9 @@ def _check(argv: Sequence[str]) -> int:
 def _pack(argv: Sequence[str]) -> None:
     """Pack finished runs into an archive."""
     parser = Parser("plab results pack", _pack.__doc__)
-    add_sources(parser, "runs to take: task=Rope,Move")
+    add_sources(parser, "runs to select: task=Rope,Move")
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
-    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
+    what = "significant digits of the iterations, >= 1 (default: all); 4 reduce the size by two thirds"
     parser.add_argument("--digits", type=positive, help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)

@@ -41,7 +41,7 @@ def render(argv: Sequence[str]) -> None:
 
     For folders and archives, it shows the run with the highest score. The suffix of FILE selects the output:
       .png         start, target and the rollout's end, side by side
-      .gif, .mp4   the rollout, with the target's ghost in it
+      .gif, .mp4   a film of the rollout, with the translucent target
 
     EXAMPLES
       plab render results/Rope-v1/adam/seed0-12ab34cd.h5
@@ -74,7 +74,7 @@ def view(argv: Sequence[str]) -> None:
     plab view KEY=VALUE ... [--output FILE.html]
     plab view --gallery [KEY=VALUE ...] [--output FOLDER]     a page of every task, and index.html
 
-    It plays in any browser: plasticine, manipulators, and the target as a ghost. Space plays and pauses,
+    It plays in any browser: plasticine, manipulators, and the translucent target. Space plays and pauses,
     arrow keys move by one step.
 
     EXAMPLES

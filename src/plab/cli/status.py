@@ -19,7 +19,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     parser = Parser("plab status", __doc__)
     add_sources(parser, "runs: task=Rope,Move variant=1 seed=0,1,2")
-    what = "ask for the suite's tasks and variants, of the methods and seeds that there are"
+    what = "request the suite's tasks and variants, with the existing methods and seeds"
     parser.add_argument("--missing", action="store_true", help=what)
     what = "show every run, live, until all have ended"
     add_forms(parser).add_argument("--watch", action="store_const", dest="form", const="watch", help=what)

@@ -54,14 +54,14 @@ def submit(argv: Sequence[str]) -> None:
     """
     parser = Parser("plab submit", submit.__doc__)
     add = parser.add_argument
-    what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
+    what = "folders of recordings or results, archives; selections of runs; with --policy, overrides"
     add("sources", nargs="*", metavar="RESULTS | KEY=VALUE", help=what)
     add("--card", type=Path, required=True, help="YAML file that describes the method")
     add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
     add("--policy", type=_policy, action="append", default=[], help=what)
     add("--steps", type=positive, help="with --policy: environment steps in the training of each policy")
-    what = f"with --policy: act in the {len(UNSEEN)} unseen configurations of the task, too"
+    what = f"with --policy: evaluate in the {len(UNSEEN)} unseen configurations of the task, too"
     add("--unseen", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources, default=None)
@@ -113,7 +113,7 @@ def verify(argv: Sequence[str]) -> int:
     parser = Parser("plab verify", verify.__doc__)
     what = f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda"
     parser.add_argument("arguments", nargs="+", help=what)
-    what = "run the policies in the files: programs of other people, so do it where they can do no harm"
+    what = "run the policies in the files; they are programs of others, so use a sandbox"
     parser.add_argument("--run-policies", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.arguments, default=None)

@@ -29,7 +29,7 @@ def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
     add("--task", type=task_list, default=suite_tasks(), help="only these tasks, such as Torus,Rope")
     options = parser.parse_intermixed_args(argv)
     if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+        parser.error(f"all variants of the tasks of --task are used: leave out '{taken[0]}'")
     return options
 
 

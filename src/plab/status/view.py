@@ -106,7 +106,7 @@ def _number(score: float) -> str:
 
 def _sums(found: Survey) -> list[str]:
     if not len(found.runs):
-        return ["no runs: plab run task=Move makes one"]
+        return ["no runs: start one with plab run task=Move"]
     totals = found.runs["state"].value_counts()
     counts = ", ".join(f"{totals[state]} {state}" for state in STATES if state in totals)
     lines = [f"{len(found.runs)} runs: {counts}"]

@@ -19,8 +19,8 @@ const short = (value) => {
 
 
 /**
- * Draw curves, each with x, y, low and high, into an SVG, and show their values where the pointer is.
- * look: log (of x), bottom and top (of y, where they are given), label (of x), side (label of y), heading (what the tip says of x).
+ * Draw curves, each with x, y, low and high, into an SVG, and show their values at the pointer.
+ * look: log (of x), bottom and top (of y, optional), label (of x), side (label of y), heading (of the tip, from x).
  */
 function drawCurves(svg, tip, curves, look) {
   const { width, height } = svg.getBoundingClientRect(), { log } = look;
@@ -29,7 +29,7 @@ function drawCurves(svg, tip, curves, look) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const room = { left: 62, right: 12, top: 8, bottom: 40 };
   const xs = curves.flatMap(({ x }) => x).filter((x) => !log || x > 0);
-  if (!xs.length) { svg.replaceChildren(make("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, "nothing to draw")); return; }
+  if (!xs.length) { svg.replaceChildren(make("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, "no data")); return; }
   const [x0, x1] = [Math.min(...xs), Math.max(...xs)];
   const y0 = look.bottom ?? Math.min(...curves.flatMap(({ low }) => low)), y1 = look.top ?? Math.max(...curves.flatMap(({ high }) => high), y0 + 1e-6);
   const scaled = (x) => (log ? Math.log(x / x0) / Math.log(x1 / x0 || 1) : (x - x0) / (x1 - x0)) || 0;
@@ -72,7 +72,7 @@ function drawCurves(svg, tip, curves, look) {
   };
 }
 
-/** Make a legend whose entries hide and show methods; hidden is a set of names. */
+/** Create a legend whose entries hide and show methods; hidden is a set of names. */
 function legendOf(shown, hidden, redraw) {
   return make("div", { class: "legend" }, ...shown.map(({ name, label, dashes }) => {
     const stroke = make("path", { d: "M0 5H30", stroke: colour(name), "stroke-width": 2.5, "stroke-dasharray": dashes });
@@ -86,7 +86,7 @@ function legendOf(shown, hidden, redraw) {
   }));
 }
 
-/** Make a box with a legend and curves; curves() gives those shown, look() how. Returns the box and what redraws it. */
+/** Create a box with a legend and curves; curves() returns the visible curves, look() their style. Returns the box and a function that redraws it. */
 function chartBox(label, shown, hidden, curves, look) {
   const svg = make("svg", { role: "img", "aria-label": label }), tip = make("div", { class: "tip", hidden: "" });
   const draw = () => drawCurves(svg, tip, curves(shown.filter(({ name }) => !hidden.has(name))), look());

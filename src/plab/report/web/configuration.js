@@ -1,7 +1,7 @@
 // A configuration, or two side by side: pictures, films, curves, runs.
 const received = new Map();
 
-/** Get a configuration's curves and runs: a script, for data may not be loaded from the file system. */
+/** Load a configuration's curves and runs as a script, because pages opened as files cannot load data. */
 function fetchDetails(name, react) {
   if (received.has(name)) { react(received.get(name)); return; }
   const script = make("script", { src: `data/${encodeURIComponent(name)}.js` });
@@ -27,13 +27,13 @@ function showConfigurations(shown) {
 function showConfiguration(one) {
   const place = make("article", { "data-name": one.name }, make("h1", {}, `${one.task}, variant ${one.variant}`));
   if (!runsOf(one)) {
-    place.append(make("p", { class: "missing" }, "There are no finished runs of this configuration: ",
-      make("code", {}, `plab run task=${one.task} variant=${one.variant}`), " makes one."));
+    place.append(make("p", { class: "missing" }, "This configuration has no finished runs. To start one: ",
+      make("code", {}, `plab run task=${one.task} variant=${one.variant}`)));
     return place;
   }
   place.append(pictures(one));
   fetchDetails(one.name, (details) => {
-    if (!details) { place.append(make("p", { class: "missing" }, `data/${one.name}.js is not there: make the page again.`)); return; }
+    if (!details) { place.append(make("p", { class: "missing" }, `data/${one.name}.js is missing: generate the page again.`)); return; }
     place.append(...films(one, details), ...chart(details), ...runTable(one, details));
   });
   return place;
@@ -42,11 +42,11 @@ function showConfiguration(one) {
 function pictures(one) {
   const made = ["start", "target"].filter((what) => one.pictures[what]);
   if (!made.length) {
-    return make("p", { class: "missing" }, "No pictures yet: ", make("code", {}, "plab report html"), " draws them where there is OpenGL, with ", make("code", {}, "pip install 'plab[render]'"), ".");
+    return make("p", { class: "missing" }, "No pictures yet: ", make("code", {}, "plab report html"), " renders them; it requires OpenGL and ", make("code", {}, "pip install 'plab[render]'"), ".");
   }
   return make("div", { class: "pictures" }, ...made.map((what) => make("figure", {},
     make("img", { src: one.pictures[what], alt: `${one.name}: ${what}`, width: 480, height: 360 }),
-    make("figcaption", {}, make("b", {}, what), make("small", {}, what === "start" ? "with the target's ghost" : "as if it were plasticine")))));
+    make("figcaption", {}, make("b", {}, what), make("small", {}, what === "start" ? "with the translucent target" : "shown as plasticine")))));
 }
 
 function films(one, details) {
@@ -69,10 +69,10 @@ function runTable(one, details) {
     const copy = make("button", { type: "button", class: "copy", title: run.command }, "copy command");
     copy.addEventListener("click", async () => {
       const copied = await copyText(run.command);
-      copy.textContent = copied ? "copied" : "cannot copy: select it here";
+      copy.textContent = copied ? "copied" : "copying failed: select the command here";
       if (!copied && !find("code", copy.parentElement)) copy.after(make("code", { class: "whole" }, run.command));
     });
-    const time = `${fixed(run.seconds, 1)} s`, place = `${run.device}${run.batch > 1 ? `, ${run.batch} at once` : ""}`;
+    const time = `${fixed(run.seconds, 1)} s`, place = `${run.device}${run.batch > 1 ? `, batch of ${run.batch}` : ""}`;
     const numbers = [run.seed, fixed(run.score, 3), fixed(run.iou, 3), run.loss === null ? "–" : run.loss.toPrecision(4).replace("-", "−"), `${run.best_iteration} of ${run.iterations}`, time];
     return make("tr", {}, make("td", {}, make("span", { class: "swatch", style: own(name) }), ` ${label}`),
       ...numbers.map((text) => make("td", { class: "number" }, String(text))), make("td", {}, place),

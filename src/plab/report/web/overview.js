@@ -21,7 +21,7 @@ function showOverview() {
     .map((one, position) => ({ one, key: sortKey(one, position) }))
     .filter(({ one }) => !only.checked || runsOf(one))
     .filter(({ one }) => words.every((word) => one.name.toLowerCase().includes(word)));
-  // What has no number stays at the end, whichever way is up.
+  // Rows without a number come last in both orders.
   rows.sort((a, b) => (a.key === null) - (b.key === null) || (state.descending ? b.key - a.key : a.key - b.key));
   const body = rows.map(({ one }) => {
     const row = make("tr", { "data-name": one.name, class: runsOf(one) ? "" : "without" },
@@ -39,7 +39,7 @@ function showOverview() {
 function headCell(sort, text) {
   const button = make("button", { type: "button" }, ...text);
   button.addEventListener("click", () => {
-    // Scores are looked at from the best downwards.
+    // Scores are sorted from the best downwards first.
     state.descending = state.sort === sort ? !state.descending : !["task", "variant"].includes(sort);
     state.sort = sort;
     showOverview();

@@ -1,4 +1,4 @@
-// What is shown at which address.
+// Routing: the parts of the page shown for an address.
 globalThis.plab = {
   /** Called by data/<configuration>.js. */
   receive: (name, details) => { received.set(name, details); },

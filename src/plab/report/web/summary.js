@@ -1,4 +1,4 @@
-// What the page opens with: a gallery, a line per task, all configurations together.
+// Start of the page: a gallery, a row per task, and the table of all configurations.
 const view = { form: "ours" };
 
 /** Return the methods that have a number in any of the rows, each with cells by method. */

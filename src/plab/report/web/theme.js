@@ -3,7 +3,7 @@
   const root = document.documentElement;
   const memory = { // storage may be forbidden for pages from the file system
     get: () => { try { return localStorage.getItem("plab-theme"); } catch { return null; } },
-    set: (value) => { try { localStorage.setItem("plab-theme", value); } catch { /* the choice lasts as long as the page */ } },
+    set: (value) => { try { localStorage.setItem("plab-theme", value); } catch { /* the choice is lost with the page */ } },
   };
   if (["light", "dark"].includes(memory.get())) root.dataset.theme = memory.get();
   document.querySelector("#theme").addEventListener("click", () => {

@@ -1,16 +1,16 @@
-// What all parts of the page of results use. All numbers are in the element #content and, curves and runs, in
+// Shared functions of the page of results. All numbers are in the element #content; curves and runs are in
 // data/<configuration>.js.
 const content = JSON.parse(document.getElementById("content").textContent);
 const { methods, configurations } = content;
 const labels = {
-  episodes: "episodes", seconds: "wall time [s], a run's share of its batch", substeps: "simulated substeps",
+  episodes: "episodes", seconds: "wall time [s], share of the batch", substeps: "simulated substeps",
   reward: "reward", score: "score", iou: "soft IoU", loss: "loss",
 };
 const shortLabels = { ...labels, seconds: "wall time" };
 const find = (selector, within = document) => within.querySelector(selector);
 const all = (selector, within = document) => [...within.querySelectorAll(selector)];
 
-/** Make an element: text is never taken for HTML. */
+/** Create an element; text is never interpreted as HTML. */
 function make(name, attributes = {}, ...children) {
   const drawing = ["svg", "path", "line", "text", "g", "rect", "circle"].includes(name);
   const node = drawing ? document.createElementNS("http://www.w3.org/2000/svg", name) : document.createElement(name);
@@ -18,7 +18,7 @@ function make(name, attributes = {}, ...children) {
   node.append(...children.filter((child) => child !== null));
   return node;
 }
-/** Write a number with the sign of a minus, not that of a hyphen. */
+/** Format a number with a minus sign instead of a hyphen. */
 const fixed = (value, digits = 2) => {
   if (value === null) return "–";
   const text = Math.abs(value).toFixed(digits);
@@ -30,7 +30,7 @@ const colour = (name) => `var(--${properties.get(name)})`;
 const own = (name) => `--own: ${colour(name)}`;
 const methodNamed = new Map(methods.map((method) => [method.name, method]));
 
-/** Make a row of buttons a choice of one. */
+/** Turn a row of buttons into an exclusive choice. */
 function choose(group, react) {
   for (const button of all("button", group)) {
     button.addEventListener("click", () => {
@@ -40,12 +40,12 @@ function choose(group, react) {
   }
 }
 
-/** Put text where it can be pasted from; return whether that worked. */
+/** Copy text to the clipboard; return whether that succeeded. */
 async function copyText(text) {
   try {
     await navigator.clipboard.writeText(text);
     return true;
-  } catch { /* there is no clipboard without a secure context, or no leave to use it */ }
+  } catch { /* the clipboard requires a secure context and a permission */ }
   const field = make("textarea", { readonly: "", class: "aside" });
   field.value = text;
   document.body.append(field);
@@ -55,7 +55,7 @@ async function copyText(text) {
   return done;
 }
 
-/** Make a film with a button to start and stop it, or a picture where there is no film. */
+/** Create a film with a button to start and stop it, or a picture if there is no film. */
 function filmOrPicture(film, picture, text) {
   if (!film) return [make("img", { src: picture, alt: text, loading: "lazy", width: 480, height: 360 })];
   const video = make("video", { src: film, poster: picture, loop: "", playsinline: "", preload: "none", width: 480, height: 360, "aria-label": text });
@@ -67,7 +67,7 @@ function filmOrPicture(film, picture, text) {
   return [video, button];
 }
 
-/** Make a button that plays or stops all films of a grid; nothing where it has none. */
+/** Create a button that plays or stops all films of a grid; null without films. */
 function playAll(grid) {
   const videos = all("video", grid);
   if (!videos.length) return null;
