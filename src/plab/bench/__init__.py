@@ -13,7 +13,7 @@ BENCHMARKS = ("speed", "accuracy", "stability", "unseen")
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Run the benchmark that the first argument names; return its exit code."""
+    """Run the benchmark named by the first argument; return its exit code."""
     name, *rest = list(argv) or ["--help"]
     if name in ("-h", "--help"):
         print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has its own --help")

@@ -29,7 +29,7 @@ DEFAULT_CAMERAS = {"front": Camera((0.5, 0.9, 1.7), (0.5, 0.15, 0.5), 45.0)}
 """Default cameras of environments."""
 
 Array: TypeAlias = Any
-"""A NumPy array, or a CUDA tensor where the caller gave one."""
+"""A NumPy array, or a CUDA tensor if the caller passed one."""
 
 
 class Observer:

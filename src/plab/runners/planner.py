@@ -97,8 +97,8 @@ class Answer:
 
 Shown: TypeAlias = "tuple[Tensor, dict[str, float]]"
 Asking: TypeAlias = "Generator[Request, Answer, Shown]"
-"""Iteration of a planner: requests that are answered, and at last the best candidate's actions in [-1, 1],
-shape [T, A], and its measures."""
+"""Iteration of a planner: a generator that yields requests, receives answers, and returns the best
+candidate's actions in [-1, 1], shape [T, A], and its measures."""
 
 
 class CandidateStart:

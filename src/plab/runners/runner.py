@@ -280,7 +280,7 @@ class Runner:
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
-        """Check that the runs are possible, then create their shared objects, at least :attr:`problem`."""
+        """Check that the runs can be executed, and create their shared objects, at least :attr:`problem`."""
         raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:

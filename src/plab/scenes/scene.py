@@ -487,8 +487,8 @@ class Scene:
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Names of the components of the action vector: of the tools by number, then of the articulated
-        model."""
+        """Names of the components of the action vector: those of the tools in order, then those of the
+        articulated model."""
         own = [f"{k}_{name}" for k, tool in enumerate(self.tools) for name in tool.kind.action_names]
         return (*own, *(self.kinematics.components if self.kinematics else ()))
 
