@@ -35,21 +35,21 @@ class Close(DistanceTerm):
     """Smooth count of the particles close to a manipulator."""
 
     @ti.func
-    def add(self, tally, d, particle):
+    def add(self, accumulator, d, particle):
         """One more share."""
         wide = ti.cast(d, ti.f64)
-        return tally + ti.Vector([ti.exp(-wide * wide / 0.02), 0.0])
+        return accumulator + ti.Vector([ti.exp(-wide * wide / 0.02), 0.0])
 
     @ti.func
-    def measure(self, tally):
+    def measure(self, accumulator):
         """The logarithm of the number."""
-        return ti.log(1.0 + tally[0])
+        return ti.log(1.0 + accumulator[0])
 
     @ti.func
-    def slope(self, tally, d, particle):
+    def slope(self, accumulator, d, particle):
         """By the distance."""
         wide = ti.cast(d, ti.f64)
-        return -2.0 * wide / 0.02 * ti.exp(-wide * wide / 0.02) / (1.0 + tally[0])
+        return -2.0 * wide / 0.02 * ti.exp(-wide * wide / 0.02) / (1.0 + accumulator[0])
 
 
 def with_tools(*kinds: str) -> list[Scene]:

@@ -31,37 +31,37 @@ class NearestContact(DistanceTerm):
 
     @ti.func
     def start(self):
-        """Initial tally: a large distance, and no particle."""
+        """Initial accumulator: a large distance, and no particle."""
         return ti.Vector([FAR, 0.0], ti.f64)
 
     @ti.func
-    def add(self, tally, d, particle):
+    def add(self, accumulator, d, particle):
         """Keep the nearer particle."""
-        out = tally
-        if ti.cast(d, ti.f64) < tally[0]:
+        out = accumulator
+        if ti.cast(d, ti.f64) < accumulator[0]:
             out = ti.Vector([ti.cast(d, ti.f64), ti.cast(particle, ti.f64)])
         return out
 
     @ti.func
-    def join(self, tally, other):
+    def join(self, accumulator, other):
         """Keep the nearer particle."""
-        out = tally
-        if other[0] < tally[0] or (other[0] == tally[0] and other[1] < tally[1]):
+        out = accumulator
+        if other[0] < accumulator[0] or (other[0] == accumulator[0] and other[1] < accumulator[1]):
             out = other
         return out
 
     @ti.func
-    def measure(self, tally):
+    def measure(self, accumulator):
         """D^2."""
-        nearest = ti.max(tally[0], 0.0)
+        nearest = ti.max(accumulator[0], 0.0)
         return nearest * nearest
 
     @ti.func
-    def slope(self, tally, d, particle):
+    def slope(self, accumulator, d, particle):
         """2 D for the nearest particle, 0 for the others."""
-        out = 0.0 * tally[0]
-        if ti.cast(particle, ti.f64) == tally[1]:
-            out = 2.0 * ti.max(tally[0], 0.0)
+        out = 0.0 * accumulator[0]
+        if ti.cast(particle, ti.f64) == accumulator[1]:
+            out = 2.0 * ti.max(accumulator[0], 0.0)
         return out
 
 
@@ -76,11 +76,11 @@ class AllContact(NearestContact):
     nearest_only = False
 
     @ti.func
-    def slope(self, tally, d, particle):
+    def slope(self, accumulator, d, particle):
         """2 D for all particles outside."""
-        out = 0.0 * tally[0]
+        out = 0.0 * accumulator[0]
         if d > 0.0:
-            out = 2.0 * ti.max(tally[0], 0.0)
+            out = 2.0 * ti.max(accumulator[0], 0.0)
         return out
 
 
@@ -92,25 +92,25 @@ class SoftContact(DistanceTerm):
     unit = "domain units^2"
 
     @ti.func
-    def add(self, tally, d, particle):
+    def add(self, accumulator, d, particle):
         """Sums of the weights, and of the weights times the distances."""
         outside = ti.max(ti.cast(d, ti.f64), 0.0)
         w = 1.0 / (1.0 + SHARPNESS * outside * outside)
-        return tally + ti.Vector([w, w * outside])
+        return accumulator + ti.Vector([w, w * outside])
 
     @ti.func
-    def measure(self, tally):
+    def measure(self, accumulator):
         """D^2."""
-        mean = tally[1] / tally[0]
+        mean = accumulator[1] / accumulator[0]
         return mean * mean
 
     @ti.func
-    def slope(self, tally, d, particle):
+    def slope(self, accumulator, d, particle):
         """2 D dD/dd, with dD/dd = (w + w' (d - D)) / sum w."""
-        out = 0.0 * tally[0]
+        out = 0.0 * accumulator[0]
         if d > 0.0:
             outside = ti.cast(d, ti.f64)
-            mean = tally[1] / tally[0]
+            mean = accumulator[1] / accumulator[0]
             w = 1.0 / (1.0 + SHARPNESS * outside * outside)
-            out = 2.0 * mean * (w - 2.0 * SHARPNESS * outside * w * w * (outside - mean)) / tally[0]
+            out = 2.0 * mean * (w - 2.0 * SHARPNESS * outside * w * w * (outside - mean)) / accumulator[0]
         return out

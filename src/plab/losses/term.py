@@ -91,37 +91,37 @@ class ParticleTerm(Term):
 class DistanceTerm(Term):
     """Sum of a function of the signed distances from all particles over the moving manipulators.
 
-    The distances of a manipulator are accumulated in a pair of float64, the tally; tallies of groups of
+    An accumulator, a pair of float64, reduces the distances of a manipulator; accumulators of groups of
     particles are joined.
 
     Attributes:
         nearest_only: The derivative with respect to a distance is nonzero for one particle only, whose number
-            is the second entry of the tally.
+            is the second entry of the accumulator.
     """
 
     nearest_only: bool = False
 
     @ti.func
     def start(self):
-        """Tally of no particle."""
+        """Initial accumulator, without particles."""
         return ti.Vector([0.0, 0.0], ti.f64)
 
     @ti.func
-    def add(self, tally, d, particle):
-        """Tally with one more particle, at distance ``d`` [domain units], negative inside the manipulator."""
-        return tally
+    def add(self, accumulator, d, particle):
+        """Add a particle at distance ``d`` [domain units], negative inside the manipulator."""
+        return accumulator
 
     @ti.func
-    def join(self, tally, other):
-        """Joint tally of two groups of particles; it must be symmetric."""
-        return tally + other
+    def join(self, accumulator, other):
+        """Join the accumulators of two groups of particles; must be symmetric."""
+        return accumulator + other
 
     @ti.func
-    def measure(self, tally):
+    def measure(self, accumulator):
         """Return the contribution of a manipulator, float64."""
-        return 0.0 * tally[0]
+        return 0.0 * accumulator[0]
 
     @ti.func
-    def slope(self, tally, d, particle):
+    def slope(self, accumulator, d, particle):
         """Derivative of :meth:`measure` with respect to the distance of a particle, float64."""
-        return 0.0 * tally[0]
+        return 0.0 * accumulator[0]

@@ -267,7 +267,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         grid_index = e * self.chunks + c
         for k, _column, term in ti.static(self.distance_terms):
             for m in range(self.manipulators):
-                self.tally_part[k, e, c, m] = term.start()
+                self.accumulator_part[k, e, c, m] = term.start()
         part = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
@@ -285,9 +285,9 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
                             for m in range(start, stop):
                                 d = self.end_distance(shape, e, m, x)
                                 for k, _column, term in ti.static(self.distance_terms):
-                                    tally = self.tally_part[k, e, c, m]
+                                    accumulator = self.accumulator_part[k, e, c, m]
                                     particle = tile * self.lanes + lane
-                                    self.tally_part[k, e, c, m] = term.add(tally, d, particle)
+                                    self.accumulator_part[k, e, c, m] = term.add(accumulator, d, particle)
         self.particle_part[e, c] = part
 
     @ti.func

@@ -386,15 +386,15 @@ class CudaPhases(OrderPhases, PosePhases):
         lanes of a warp; all lanes of a warp must take part."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
         for k, _column, term in ti.static(self.distance_terms):
-            tally = term.start()
+            accumulator = term.start()
             for r in range((self.particles - group + DISTANCE_GROUPS - 1) // DISTANCE_GROUPS):
                 particle = group + r * DISTANCE_GROUPS
-                tally = term.add(tally, self.distance[first + particle], particle)
+                accumulator = term.add(accumulator, self.distance[first + particle], particle)
             for step in ti.static(range(RUN_BITS)):
-                above = [self.wide_from_above(tally[i], 1 << step) for i in range(2)]
-                tally = term.join(tally, ti.Vector([above[0], above[1]]))
+                above = [self.wide_from_above(accumulator[i], 1 << step) for i in range(2)]
+                accumulator = term.join(accumulator, ti.Vector([above[0], above[1]]))
             if group % WARP == 0:
-                self.tally_part[k, e, group // WARP, m] = tally
+                self.accumulator_part[k, e, group // WARP, m] = accumulator
 
     # -- threads ------------------------------------------------------------------------------------
 

@@ -74,13 +74,13 @@ class TermPhases(Storage):
         self.particle_terms = self._with("gradient")
         self.distance_terms = self._with("nearest_only")
         self.term_weights = self.share(ti.field(self.real, shape=max(1, len(self.terms))))
-        # Sums over nodes and the largest mass; sums over particles; tallies of distances.
+        # Sums over nodes and the largest mass; sums over particles; accumulators of distances.
         parts, m = (self.batch, self.chunks), max(1, self.manipulators)
-        sums, tallies = max(1, len(self.particle_terms)), max(1, len(self.distance_terms))
+        sums, accumulators = max(1, len(self.particle_terms)), max(1, len(self.distance_terms))
         self.node_part = ti.Vector.field(len(self.node_terms) + 1, ti.f64, shape=parts)
         self.particle_part = ti.Vector.field(sums, ti.f64, shape=parts)
-        self.tally_part = ti.Vector.field(2, ti.f64, shape=(tallies, self.batch, self.shares, m))
-        self.tally = ti.Vector.field(2, ti.f64, shape=(tallies, self.batch, m))
+        self.accumulator_part = ti.Vector.field(2, ti.f64, shape=(accumulators, self.batch, self.shares, m))
+        self.accumulator = ti.Vector.field(2, ti.f64, shape=(accumulators, self.batch, m))
         for term in self.terms:
             term.attach(self)
 
@@ -238,7 +238,9 @@ class TermPhases(Storage):
         p = self.local_point(shape, e, m, x)
         d, n = signed_distance(shape, p, self.size[e, m], gap)
         n64 = ti.cast(n, ti.f64)
-        d_bar = ti.cast(self.term_weights[column], ti.f64) * term.slope(self.tally[k, e, m], d, particle)
+        d_bar = ti.cast(self.term_weights[column], ti.f64) * term.slope(
+            self.accumulator[k, e, m], d, particle
+        )
         x_bar = d_bar * n64
         if ti.static(self.rotated(shape)):
             x_bar = self.pose_rotation(e, m) @ x_bar
@@ -264,7 +266,7 @@ class TermPhases(Storage):
                 for shape, start, stop in ti.static(self.shape_ranges):
                     if ti.static(self.moves(shape)):
                         for m in range(start, stop):
-                            particle = ti.cast(self.tally[k, e, m][1], ti.i32)
+                            particle = ti.cast(self.accumulator[k, e, m][1], ti.i32)
                             tile = particle // self.lanes
                             lane = particle - tile * self.lanes
                             x = self.vector(state, self.tile_entry(slot, e, tile), lane)
@@ -296,7 +298,7 @@ class TermPhases(Storage):
 
     @ti.func
     def join_measures(self, e, terms: ti.template(), at):
-        """Join the parts of an environment's sums and tallies, and write its measures from entry ``at``."""
+        """Join the parts of an environment's reductions, and write its measures from entry ``at``."""
         part = self.node_part[e, 0]
         sums = self.particle_part[e, 0]
         last = ti.static(len(self.node_terms))
@@ -316,11 +318,11 @@ class TermPhases(Storage):
             for shape, start, stop in ti.static(self.shape_ranges):
                 if ti.static(self.moves(shape)):
                     for m in range(start, stop):
-                        tally = self.tally_part[k, e, 0, m]
+                        accumulator = self.accumulator_part[k, e, 0, m]
                         for c in range(1, self.shares):
-                            tally = term.join(tally, self.tally_part[k, e, c, m])
-                        self.tally[k, e, m] = tally
-                        total += term.measure(tally)
+                            accumulator = term.join(accumulator, self.accumulator_part[k, e, c, m])
+                        self.accumulator[k, e, m] = accumulator
+                        total += term.measure(accumulator)
             terms[at + column] = total
         terms[at + ti.static(len(self.terms))] = part[last]
         terms[at + ti.static(len(self.terms) + 1)] = ti.cast(self.fault[e], ti.f64)
