@@ -250,8 +250,7 @@ def test_stacks_on_cuda_learn_what_those_on_the_cpu_learn(name: str) -> None:
     first = [p.detach().clone() for p in agents.parameters()]
     with torch_settings(1):
         played = {kind: deque(drawn) for kind, drawn in taped_and_played(agents, *scripts).items()}
-        for kind, drawn in played.items():
-            setattr(others.draws, kind, lambda *shape, drawn=drawn: drawn.popleft().cuda())
+        others.draws.draw = lambda kind, *shape: played[kind].popleft().cuda()
         play(others, *scripts)
     after = [p.detach().cpu() for p in others.parameters()]
     pairs = list(zip(agents.parameters(), after, strict=True))

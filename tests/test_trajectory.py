@@ -319,7 +319,7 @@ def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatc
     assert (options["project"], options["name"], options["id"]) == ("plab", name, name)
     assert (options["dir"], options["config"], options["resume"]) == (str(tmp_path), {"seed": 0}, "allow")
     monkeypatch.setenv("WANDB_PROJECT", "closed")
-    with pytest.raises(ResultsError, match=r"^logger=wandb fails: no answer .*WANDB_MODE.*logger=none"):
+    with pytest.raises(ResultsError, match=r"^logger=wandb: no answer .*WANDB_MODE.*logger=none"):
         RunLog(cfg, run).write({"loss": 1.0}, 0)
     quiet = RunLog(replace(cfg, logger="none"), run)
     quiet.write({"loss": 1.0}, 0)
