@@ -22,20 +22,20 @@ SHARED = (
     "digits_convention",
     "floor_stencil",
 )
-"""Properties that must agree between the scenes of a simulator, besides the shapes of manipulators."""
+"""Properties, in addition to manipulator shapes, that all scenes of a simulator must share."""
 
 
 def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
-    """Return a key that is equal for scenes that can share a simulator, in sequence or in a batch: names of
-    properties and their values."""
+    """Return a key of property names and values that is equal for scenes that can share a simulator, in
+    sequence or in a batch."""
     shared = ((name, getattr(scene, name)) for name in SHARED)
     topology = scene.kinematics.topology if scene.kinematics else ()
     return (*shared, ("manipulators", (*(tool.shape for tool in scene.manipulators), topology)))
 
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
-    """Raise SceneError if scenes cannot be simulated or cannot share a simulator, also with the scene
-    ``like`` if given."""
+    """Raise SceneError if scenes, and the scene ``like`` if given, cannot be simulated or cannot share a
+    simulator."""
     if isinstance(scenes, Scene):
         raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
     if not scenes:
@@ -94,7 +94,7 @@ def material_keys(scene: Scene) -> tuple[str, ...]:
 
 
 def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tuple[Scene, ...]:
-    """Return the scenes with other material parameters, without validation.
+    """Return copies of the scenes with other material parameters, without validation.
 
     Args:
         scenes: One scene per environment.

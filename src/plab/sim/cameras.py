@@ -1,4 +1,4 @@
-"""Depth, segmentation and colour pictures of all environments of a simulator, on its device.
+"""Depth, segmentation and colour images of all environments of a simulator, rendered on its device.
 
 Two passes per camera: one ray per pixel intersects the floor in closed form and manipulators by sphere
 tracing; then each particle is drawn as a ball of the particle's volume. A pixel is one integer with depth in
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["BACKGROUND", "FIRST_BODY", "FIRST_MANIPULATOR", "FLOOR", "CameraSensor"]
 
 BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
-"""Labels of segmentation; manipulators and bodies are numbered from the last two on."""
+"""Segmentation labels; manipulators and bodies are numbered from the last two on."""
 
 BALL_RADIUS = 0.7
 """Radius of a particle's ball [mean particle spacings], chosen such that depth is unbiased."""
@@ -68,7 +68,7 @@ class CameraSensor:
         self.refresh()
 
     def refresh(self) -> None:
-        """Update after a change of the simulator's scenes."""
+        """Update after the simulator's scenes have changed."""
         scenes = self._simulator.scenes
         spacings = [[(b.volume / b.particles) ** (1 / 3) for b in scene.bodies] for scene in scenes]
         balls = [
@@ -117,7 +117,7 @@ class CameraSensor:
         return out
 
     def _filled(self, write: Any, kind: type, like: Any, *arguments: Any) -> Any:
-        """Return a picture that a kernel writes, as an array or a CUDA tensor like ``like``."""
+        """Fill an image by a kernel; return an array, or a CUDA tensor like ``like``."""
         shape = self.batch, self.height, self.width
         if on_device(like):
             real = kind is np.float32
@@ -134,7 +134,7 @@ class CameraSensor:
 
     @ti.func
     def key(self, depth, label):
-        """Encode positive depth and label as an integer, ordered by depth."""
+        """Encode positive depth and label as an integer ordered by depth."""
         return (ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64) << 32) | ti.cast(label, ti.i64)
 
     @ti.func
@@ -143,7 +143,7 @@ class CameraSensor:
 
     @ti.func
     def axis(self, frame: ti.template(), k: ti.template()):
-        """Position (0) of the camera, and its axes to the right (1), up (2) and backwards (3)."""
+        """Position (0) of the camera, and its right (1), up (2) and backward (3) axes."""
         return ti.Vector([frame[3 * k], frame[3 * k + 1], frame[3 * k + 2]])
 
     @ti.func
@@ -155,7 +155,7 @@ class CameraSensor:
 
     @ti.kernel
     def _trace(self, frame: Array, keys: Array, focal: ti.f32, near: ti.f32, far: ti.f32):
-        """Write floor and manipulators."""
+        """Write the floor and the manipulators."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
             origin = self.axis(frame, 0)
@@ -238,8 +238,8 @@ class CameraSensor:
 
     @ti.func
     def slope(self, keys: ti.template(), frame: ti.template(), e, row, column, down: ti.template(), focal):
-        """Difference of positions between a pixel and its neighbour to the right or below, or on the other
-        side if that is nearer in depth."""
+        """Difference in position between a pixel and its right or lower neighbour, or the opposite one if
+        that is nearer in depth."""
         here = self.point(keys, frame, e, row, column, focal)
         across = ti.static(0 if down else 1)
         after = self.point(
@@ -257,7 +257,7 @@ class CameraSensor:
 
     @ti.kernel
     def _write_light(self, keys: Array, frame: Array, focal: ti.f32, out: Array):
-        """Shade manipulators and bodies by the angle of their surface to a light near the camera."""
+        """Shade manipulators and bodies by the angle between their surface and a light near the camera."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
             row, column = pixel // self.width, pixel % self.width
@@ -272,7 +272,7 @@ class CameraSensor:
 
 
 def _colours(labels: Any, light: Any) -> Any:
-    """Return colours of labels times light, shape [..., 3], uint8; arrays or CUDA tensors."""
+    """Return label colours times light, shape [..., 3], uint8, as arrays or CUDA tensors."""
     bodies = len(PALETTE) - 3
     chosen = (labels >= FIRST_BODY) * (1 + (labels - FIRST_BODY) % bodies) + labels.clip(0, FIRST_MANIPULATOR)
     if not on_device(labels):

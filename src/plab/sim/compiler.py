@@ -131,8 +131,7 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 def clear_kernel_arguments() -> None:
-    """Drop the arguments that kernels were called with before Taichi was reinitialised: clears
-    ``Kernel.mapper``.
+    """Drop the arguments of kernels from before a reinitialisation of Taichi: clears ``Kernel.mapper``.
 
     Otherwise Taichi's own kernels keep references to all fields, about 100 kB per simulator.
     """
@@ -169,8 +168,8 @@ def guard_array_release() -> None:
 
 
 def place_fields() -> Any:
-    """Place the fields declared so far in memory of their own, and return its handle for :func:`free_fields`;
-    None without such fields: uses ``impl._root_fb``.
+    """Place the fields declared so far in separate memory, and return its handle for :func:`free_fields`, or
+    None if there are none: uses ``impl._root_fb``.
 
     Otherwise Taichi places them at the next launch, and frees them only when it is reinitialised.
     """
@@ -182,7 +181,7 @@ def place_fields() -> Any:
 
 
 def free_fields(handle: Any) -> None:
-    """Free fields that are not in use by any kernel.
+    """Free fields that no kernel is using.
 
     ``SNodeTree.destroy`` would also cause the kernels of all other simulators to be recompiled.
     """
@@ -205,7 +204,7 @@ def cache_lock() -> Path:
 
 
 def cuda_available() -> bool:
-    """Return whether Taichi can open a CUDA device; ``ti.init`` would fall back to the CPU without."""
+    """Return whether Taichi can open a CUDA device; ``ti.init`` would silently fall back to the CPU."""
     return bool(ti._lib.core.with_cuda())
 
 
@@ -216,7 +215,7 @@ local_variable = impl.expr_init
 
 
 def bitcode_function(path: str, symbol: str) -> Callable[..., None]:
-    """Return a function from a file of LLVM bitcode, which Taichi links into kernels; its arguments are local
+    """Return a function from an LLVM bitcode file, which Taichi links into kernels; its arguments are local
     variables.
 
     Sets ``SourceBuilder.bc`` and ``mode`` directly, because the public interface compiles C++ with clang.

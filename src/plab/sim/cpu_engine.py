@@ -1,4 +1,4 @@
-"""Engine of the CPU: phases of a substep by chunks of particles and shares of the blocks, and its kernels.
+"""CPU engine: substep phases for chunks of particles and parts of the block list, and the kernels.
 
 Each chunk has a private grid, so that scattering needs no atomics. A launch executes a whole environment
 step. A team of threads works on one environment and synchronises at barriers between phases (a launch costs a
@@ -21,8 +21,7 @@ from plab.sim.term_phases import TermPhases
 BLOCK_NODES = BLOCK**3
 
 MIN_TASK_SIZE = 512
-"""Least number of iterations that Taichi schedules as one CPU task; every ``MIN_TASK_SIZE``-th iteration does
-the work of a thread."""
+"""Minimum iterations per CPU task in Taichi; every ``MIN_TASK_SIZE``-th iteration does a thread's work."""
 
 PADDING = 32
 """Stride between the barrier counters of teams, to avoid sharing cache lines."""
@@ -39,7 +38,7 @@ SLOW_TEAM_RATIO = 1.5
 
 
 class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
-    """All phases, for one chunk at a time."""
+    """All phases, one chunk at a time."""
 
     shares = CHUNKS
 
@@ -54,7 +53,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         )
 
     def allocate_impulses(self) -> None:
-        """Allocate the sums of impulses, before the first kernel is compiled."""
+        """Allocate the impulse sums. Call before the first kernel is compiled."""
         self.sums_impulses = True
         self.impulse_part = ti.Vector.field(
             3, ti.f64, shape=(self.batch * self.chunks, max(1, self.manipulators))
@@ -86,8 +85,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def first_entry(self, e, c):
-        """First entry of a chunk's part of the environment's block list: blocks not touched by earlier
-        chunks."""
+        """First entry of a chunk's part of the environment's block list, which holds the blocks that no
+        earlier chunk touches."""
         return e * self.blocks + self.block_first[e, c]
 
     # -- phases of one chunk ------------------------------------------------------------------------
@@ -106,8 +105,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
         stamp,
         adjoint: ti.template(),
     ):
-        """Material update, and scatter of momentum and mass; in the backward pass (``adjoint``) without
-        update, and with scatter of the adjoint of the grid velocities."""
+        """Update the material, and scatter momentum and mass; in the backward pass (``adjoint``) omit the
+        update and also scatter the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
         at = self.masked_index(grid_index * STENCILS)
         bases_at = self.masked_index(grid_index * BASES)
@@ -135,7 +134,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def grid_chunk(self, e, c, s):
-        """Grid update of a part of the environment's blocks; the private grids are cleared for the next
+        """Update the grid in a part of the environment's blocks, and clear the private grids for the next
         substep."""
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
@@ -161,7 +160,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def gather_chunk(self, state: ti.template(), state_at, before, after, e, c, time):
-        """Velocities, affine matrices and positions after the substep."""
+        """Gather velocities, affine matrices and positions after the substep."""
         grid_index = e * self.chunks + c
         at = self.masked_index(grid_index * STENCILS)
         bases_at = self.masked_index(grid_index * BASES)
@@ -194,7 +193,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
     def gather_chunk_adjoint(
         self, state: ti.template(), state_at, before, after, bar: ti.template(), bar_at, e, c
     ):
-        """Adjoints of the particles before the substep."""
+        """Compute the adjoints of the particles before the substep."""
         grid_index = e * self.chunks + c
         at = self.masked_index(grid_index * STENCILS)
         bases_at = self.masked_index(grid_index * BASES)
@@ -225,7 +224,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
-        """Poses and frames of all manipulators in all substeps of environment step t."""
+        """Compute poses and frames of all manipulators in all substeps of environment step t."""
         for _shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 self.advance_manipulator(e, start, m, actions, poses, t, before, after)
@@ -234,18 +233,19 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):
-        """Add to a frame's adjoint, where one thread owns it."""
+        """Add to a frame's adjoint, which one thread owns."""
         wide = ti.cast(value, ti.f64)
         self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     @ti.func
     def accumulate_world(self, grid_index, e, entry, value):
-        """Add to an adjoint of frictions and gravity, where one thread owns it."""
+        """Add to an adjoint of friction or gravity, which one thread owns."""
         self.world_bar[grid_index, entry] = self.world_bar[grid_index, entry] + ti.cast(value, ti.f64)
 
     @ti.func
     def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
-        """Adjoint of all manipulators' motion in substep s: pose_bar goes from its end to its start."""
+        """Backpropagate all manipulators' motion in substep s: ``pose_bar`` goes from its end to its
+        start."""
         for _shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
@@ -263,7 +263,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
-        """Scatter mass, sum the particle terms, and accumulate distances from the manipulators."""
+        """Scatter mass, sum the particle terms, and accumulate distances from manipulators."""
         grid_index = e * self.chunks + c
         for k, _column, term in ti.static(self.distance_terms):
             for m in range(self.manipulators):
@@ -292,7 +292,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def node_terms_chunk(self, e, c):
-        """Sum the terms of a part of the blocks, and write mass and the slope of the loss to the nodes."""
+        """Sum the node terms in a part of the blocks, and write mass and the derivative of the loss to the
+        nodes."""
         part = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         last = ti.static(len(self.node_terms))
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
@@ -331,20 +332,20 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
 
 class TeamChoice:
-    """Selection of the fastest team of threads for the launches of a kernel.
+    """Selection of the fastest thread team for the launches of a kernel.
 
     Barriers are slow if other programs keep the cores busy, because waiting threads spin. Results do not
     depend on the choice.
     """
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first of some teams, given by their numbers of threads; the others are tried in
+        """Start with the first of several teams, given by their numbers of threads; try the others in
         order."""
         self._seconds: dict[int, deque[float]] = {size: deque(maxlen=TIMED_LAUNCHES) for size in sizes}
         self._launches, self._probe_at = 0, PROBE_FIRST
 
     def run(self, kernel: Callable, args: tuple) -> None:
-        """Launch a kernel with a team's size before its other arguments."""
+        """Launch a kernel with the team size prepended to its arguments."""
         self._launches += 1
         size = self._next()
         start = time.perf_counter()
@@ -373,7 +374,7 @@ class CpuEngine(CpuPhases):
 
     The public methods are :meth:`step`, :meth:`losses`, :meth:`step_adjoint`, :meth:`place`,
     :meth:`export_mass`, :meth:`observe` and :meth:`copy_slot`;
-    :class:`plab.sim.cuda_engine.CudaEngine` has the same.
+    :class:`plab.sim.cuda_engine.CudaEngine` has the same interface.
     """
 
     sorts = False
@@ -384,15 +385,16 @@ class CpuEngine(CpuPhases):
         self._teams = {name: TeamChoice((self.team_size, 1)) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, state: ti.Ndarray, *args: object) -> None:
-        """One environment step; arguments as for :meth:`step_kernel`, without size and address."""
+        """Run one environment step; arguments as for :meth:`step_kernel`, without size and address."""
         self._teams["step"].run(self.step_kernel, (state, address_of(state), *args))
 
     def losses(self, *args: object) -> None:
-        """Loss terms; arguments as for :meth:`losses_kernel` after the team's size."""
+        """Compute loss terms; arguments as for :meth:`losses_kernel` after the team size."""
         self._teams["losses"].run(self.losses_kernel, args)
 
     def step_adjoint(self, state: ti.Ndarray, bar: ti.Ndarray, *args: object) -> None:
-        """Adjoint of one step; arguments as for :meth:`step_adjoint_kernel`, without size and addresses."""
+        """Run the adjoint of one step; arguments as for :meth:`step_adjoint_kernel`, without size and
+        addresses."""
         arrays = state, address_of(state), bar, address_of(bar)
         self._teams["step_adjoint"].run(self.step_adjoint_kernel, (*arrays, *args))
 
@@ -409,8 +411,8 @@ class CpuEngine(CpuPhases):
 
     @ti.func
     def first_chunk(self, rank, size):
-        """First chunk of a thread's share. Neighbouring chunks are neighbours in space, so that threads share
-        few grid nodes."""
+        """First chunk of a thread's share. Consecutive chunks are neighbours in space, so threads share few
+        grid nodes."""
         return rank * self.chunks // size
 
     # -- terms of the loss, one environment ---------------------------------------------------------
@@ -436,8 +438,8 @@ class CpuEngine(CpuPhases):
     def loss_gradient_of_team(
         self, state: ti.template(), slot, bar: ti.template(), e, team, rank, size, contact
     ):
-        """Add the gradient of one environment's loss to the adjoints of its particles and poses; only to
-        those of the poses without ``contact``."""
+        """Add the gradient of one environment's loss to the adjoints of its particles and poses, or only of
+        its poses without ``contact``."""
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
             if contact:
                 for tile in range(self.first_tile(c), self.first_tile(c + 1)):
@@ -473,7 +475,7 @@ class CpuEngine(CpuPhases):
         pose_after: ti.i32,
         stamp: ti.i32,
     ):
-        """One environment step from time slot ``slot``; each substep moves on by ``stride`` slots (0: in
+        """Run one environment step from time slot ``slot``; each substep advances by ``stride`` slots (0: in
         place)."""
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
@@ -508,7 +510,7 @@ class CpuEngine(CpuPhases):
     def losses_kernel(
         self, size: ti.i32, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32
     ):
-        """Measures of all environments, written to ``terms`` from entry ``at``."""
+        """Write the measures of all environments to ``terms`` from entry ``at``."""
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
@@ -539,8 +541,8 @@ class CpuEngine(CpuPhases):
         stamp: ti.i32,
         contact: ti.i32,
     ):
-        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps``, and of its
-        loss, whose measures are written to ``terms`` from entry ``at``.
+        """Run the adjoint of one environment step, with states in slots ``slot`` to ``slot + substeps``, and
+        of its loss, whose measures are written to ``terms`` from entry ``at``.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it,
         ``pose_bar`` likewise. If there was no ``contact`` up to the end of this step, ``bar`` is not needed

@@ -1,4 +1,5 @@
-"""Transfers and material of a tile of particles on the CPU, by lanes of SIMD registers, and their adjoints.
+"""Particle-grid transfers and material updates on the CPU, in SIMD lanes over tiles of particles, and their
+adjoints.
 
 LLVM vectorises loops that begin with loads from a field or end with stores to one. A transfer therefore first
 writes the stencil data of a tile to ``stencils`` (lane vectors, one particle per lane), and then sums over
@@ -45,7 +46,7 @@ KEY = 1
 REACHING = tuple(
     sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8)
 )
-"""For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
+"""Bit mask of the kinds of crossing that reach each of the 8 blocks around the base node's block."""
 
 
 class TilePhases(ParticlePhases):
@@ -55,7 +56,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def arguments(self, unit: ti.template(), at: ti.template(), numbers: ti.template()):
-        """Return addresses, the nodes per axis for ``transfers``, and numbers as bitcode takes them.
+        """Return addresses, the nodes per axis for ``transfers``, and numbers in the form that bitcode takes.
 
         Addresses are those of a node in a grid, of one particle's number in the first of some lane vectors,
         and of a tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
@@ -108,7 +109,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def stencil_tile(self, state: ti.template(), source, at, bases_at, slopes: ti.template()):
-        """Write weights, offsets and base nodes of a tile's particles, and on request the slopes of the
+        """Write weights, offsets and base nodes of a tile's particles, and on request the derivatives of the
         weights, to the thread's part of ``stencils`` and ``bases``."""
         node = ti.Vector.zero(ti.i32, self.lanes)
         block = ti.Vector.zero(ti.i32, self.lanes)
@@ -132,7 +133,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def momentum_tile(self, state: ti.template(), source, entry9, at):
-        """Value at the base node of the momentum that each particle of a tile scatters."""
+        """Value at the base node of the momentum field that each particle of a tile scatters."""
         f = [self.stencils[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
             row = [self.affine[entry9 + 3 * i + j] for j in range(3)]
@@ -142,7 +143,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def adjoint_tile(self, state: ti.template(), source, after, bar: ti.template(), target, at):
-        """Value at the base node of each particle's contribution to the adjoint of the velocities."""
+        """Value at the base node of each particle's contribution to the adjoint of the grid velocities."""
         f = [self.stencils[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
             row = [bar[target + AT_C + 3 * i + j] for j in range(3)]
@@ -172,7 +173,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def gather_particle(self, state_at, source, target, lane, node, e, time, at):
-        """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
+        """Transfer from grid to particle: v, C and x after the substep; ``time`` is recorded if the speed is
+        implausible."""
         addresses = [
             ti.get_addr(self.velocity, [node]),
             self.lane_in(self.stencils, at, lane),
@@ -184,7 +186,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def gather_particle_adjoint(self, state_at, source, after, bar_at, target, entry9, lane, node, at):
-        """Adjoint of both transfers for one particle: of x and v in the array at ``bar_at``, and of A in
+        """Adjoint of both transfers of one particle, for x and v in the array at ``bar_at`` and A in
         ``affine``."""
         addresses = [
             ti.get_addr(self.velocity, [node]),
@@ -240,7 +242,7 @@ class TilePhases(ParticlePhases):
     # -- material -----------------------------------------------------------------------------------
 
     def fill_laws(self, scenes: Sequence[Scene]) -> None:
-        """Write a bit mask of each tile's laws if there are several."""
+        """Write a bit mask of each tile's laws if there are several laws."""
         if len(self.laws) > 1:
             numbers = np.array([[self.laws.index(m.kind) for m in s.materials] for s in scenes])
             own = numbers[np.arange(self.batch).reshape(-1, 1, 1, 1), self._bodies]
@@ -248,7 +250,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def has_law(self, entry9, number: ti.template()):
-        """Return True if any lane of a tile has the law of a number."""
+        """Return True if any lane of a tile has the law with a given number."""
         if ti.static(len(self.laws) > 1):
             return self.tile_laws[entry9 // 9] & (1 << number) != 0
         else:
@@ -256,8 +258,8 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def put_parameters(self, e, entry9, at, first: ti.template(), count: ti.template()):
-        """Write a tile's coefficients to ``strains`` and, with several laws, the number of each lane's
-        law."""
+        """Write a tile's coefficients and, if there are several laws, each lane's law number to
+        ``strains``."""
         p = self.parameters_of_tile(e, entry9)
         for i in ti.static(range(count)):
             self.strains[at + first + i] = p[i]
@@ -275,8 +277,8 @@ class TilePhases(ParticlePhases):
     def material_tile(
         self, state: ti.template(), state_at, source, target, entry9, e, at, update: ti.template()
     ):
-        """A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry ``at``;
-        the new F is stored if ``update``."""
+        """Compute A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry
+        ``at``; store the new F if ``update``."""
         first, x, affine, new = self.law_places(state_at, source, state_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
@@ -323,7 +325,7 @@ class TilePhases(ParticlePhases):
     def material_tile_adjoint(
         self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
     ):
-        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
+        """Adjoints of a tile's C and F, given those of A (in ``affine``) and the new F (in ``bar``)."""
         first, x, affine, bars = self.law_places(state_at, source, bar_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
@@ -368,7 +370,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def accumulate_material(self, row, bars: ti.template()):
-        """Add to a material's adjoint, where one thread owns it."""
+        """Add to a material's adjoint, which one thread owns."""
         for i in ti.static(range(len(bars))):
             wide = ti.cast(bars[i], ti.f64)
             self.material_bar[row, i] = self.material_bar[row, i] + wide

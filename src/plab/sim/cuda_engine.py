@@ -1,4 +1,4 @@
-"""CUDA engine and its kernels: one thread per particle, per node of an active block, per pose.
+"""CUDA engine and its kernels, with one thread per particle, active grid node or pose.
 
 A substep is one launch from Python of a kernel with several parallel loops, because each launch costs 13 to
 17 microseconds and each loop only a few. The host never waits for the device: the number of active blocks is
@@ -37,7 +37,7 @@ MULTIPROCESSORS, SHARED_BYTES = 16, 81
 
 
 def device_attribute(number: int) -> int:
-    """Return an attribute of the CUDA device from the driver, since Taichi does not provide it; 1 on
+    """Return an attribute of the CUDA device from the driver, because Taichi does not provide it; 1 on
     failure."""
     value = ctypes.c_int(0)
     driver = cuda_driver()
@@ -48,7 +48,7 @@ def device_attribute(number: int) -> int:
 
 @ti.data_oriented
 class CudaEngine(CudaPhases):
-    """Kernels for CUDA; public methods as those of :class:`plab.sim.cpu_engine.CpuEngine`.
+    """Kernels for CUDA, with the public methods of :class:`plab.sim.cpu_engine.CpuEngine`.
 
     ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
     its length. It is cleared before each environment step and each loss, and only grows in between: visiting
@@ -81,7 +81,7 @@ class CudaEngine(CudaPhases):
 
     @property
     def resident(self) -> bool:
-        """True if a step is one launch."""
+        """True if a step is a single launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
         # Blocks that move poses are among the resident ones.
         fits = few and self.frame_threads <= self.resident_threads
@@ -97,7 +97,8 @@ class CudaEngine(CudaPhases):
     # -- public methods -----------------------------------------------------------------------------
 
     def step(self, state, poses, actions, slot, stride, t, pose_before, pose_after, stamp) -> None:
-        """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
+        """Run one environment step from time slot ``slot``; each substep advances by ``stride`` slots (0: in
+        place)."""
         if self.resident:
             self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
             return
@@ -109,8 +110,9 @@ class CudaEngine(CudaPhases):
     def step_adjoint(
         self, state, bar, poses, actions, actions_bar, terms, at, slot, t, stamp, contact
     ) -> None:
-        """Adjoint of one environment step, as :meth:`plab.sim.cpu_engine.CpuEngine.step_adjoint_kernel`;
-        without ``contact``, ``bar`` does not contain the adjoint."""
+        """Run the adjoint of one environment step, as
+        :meth:`plab.sim.cpu_engine.CpuEngine.step_adjoint_kernel`; without ``contact``, ``bar`` does not
+        contain the adjoint."""
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
         self.losses(state, end, terms, at, stamp)
@@ -126,7 +128,7 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def advance_kernel(self, poses: Array, actions: Array, t: ti.i32, before: ti.i32, after: ti.i32):
-        """Poses and frames of all substeps of environment step t."""
+        """Compute poses and frames of all substeps of environment step t."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.frame_threads):
             self.set_frames(w, self.frame_threads, poses, actions, t, before, after)
@@ -135,7 +137,7 @@ class CudaEngine(CudaPhases):
     def substep_kernel(
         self, state: Array, before: ti.i32, after: ti.i32, s: ti.i32, time: ti.i32, stamp: ti.i32
     ):
-        """Substep s of all environments, from time slot ``before`` to ``after``."""
+        """Run substep s of all environments, from time slot ``before`` to ``after``."""
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
             self.scatter_thread(state, before, after, q, time, stamp, 1)
@@ -161,7 +163,7 @@ class CudaEngine(CudaPhases):
         pose_after: ti.i32,
         stamp: ti.i32,
     ):
-        """One environment step in a single launch, for few particles: resident threads synchronise at
+        """Run one environment step in a single launch, for few particles. Resident threads synchronise at
         barriers between the phases, because launches would take longer than the phases."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
@@ -185,8 +187,8 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def losses(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
-        """Write the measures of all environments to ``terms`` from entry ``at``, and mass and the slope of
-        the loss to the nodes of active blocks."""
+        """Write the measures of all environments to ``terms`` from entry ``at``, and mass and the derivative
+        of the loss to the nodes of active blocks."""
         for q in range(self.part_threads):
             e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, self.parts)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
@@ -242,7 +244,8 @@ class CudaEngine(CudaPhases):
     def substep_adjoint_kernel(
         self, state: Array, bar: Array, before: ti.i32, after: ti.i32, s: ti.i32, stamp: ti.i32
     ):
-        """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
+        """Run the adjoint of substep s: scatter again, with the adjoint of the grid velocities, and
+        backpropagate."""
         if ti.static(self.deterministic):
             for e in range(self.batch):
                 self.adjoint_bound[e] = 0
@@ -260,7 +263,8 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
-        """Adjoints of all substeps of an environment step in one launch, as :meth:`resident_step_kernel`."""
+        """Run the adjoints of all substeps of an environment step in one launch, as
+        :meth:`resident_step_kernel`."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
             for back in range(self.substeps):
@@ -280,7 +284,7 @@ class CudaEngine(CudaPhases):
 
     @ti.kernel
     def retreat_kernel(self, actions: Array, actions_bar: Array, t: ti.i32):
-        """Adjoint of all manipulators' motion in environment step t, from its frames' adjoints."""
+        """Backpropagate all manipulators' motion in environment step t from the adjoints of its frames."""
         for q in range(self.pose_threads * self.substeps):
             m = q % self.pose_threads // self.batch
             for _shape, start, stop in ti.static(self.shape_ranges):

@@ -1,5 +1,5 @@
-"""Phases for CUDA, organised for many threads and registers: first those of one particle or node, then those
-of one thread, shared by launches of a substep and of a whole step.
+"""CUDA phases, designed for many threads and registers: first per particle or node, then per thread, shared
+by the launches of a substep and of a whole step.
 
 Transfers accumulate in registers. Poses are advanced by one thread per manipulator. Frame adjoints are stored
 per substep, so that the pose adjoints take one launch per environment step. Distances are reduced without
@@ -32,15 +32,14 @@ DISTANCE_GROUPS = 256
 """Threads per environment and manipulator that reduce distances; a multiple of the warp size."""
 
 MOMENTUM_AND_MASS, MASS, VELOCITY = (0, 1, 2, 3), (3,), (0, 1, 2)
-"""Components of grids that are scattered to."""
+"""Components of a scattered grid."""
 
 RESIDENT_BLOCK = WARP_BLOCK
 """Threads per block of the single-launch step; Taichi limits registers to those of two blocks per
 multiprocessor."""
 
 MAX_TESTED_MANIPULATORS = 6
-"""Largest number of manipulators for which each node tests all. With more, warps first select those within
-reach of the block."""
+"""Largest number of manipulators that every node tests. With more, warps first select those nearby."""
 
 POSE_SHARE = 8
 """Manipulators advanced per block."""
@@ -65,7 +64,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @property
     def node_mask(self) -> int:
-        """Largest number of a node of all environments, all bits set."""
+        """Index mask for the nodes of all environments: the largest index with all bits set."""
         return int(min(1 << (self.batch * self.nodes).bit_length(), 1 << 31) - 1)
 
     def attach(self, terms: Sequence[Any]) -> None:
@@ -94,7 +93,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def add_impulse(self, row, m, value):
-        """Add to an environment's impulse; ``row`` is its number."""
+        """Add to an environment's impulse in row ``row``."""
         for i in ti.static(range(3)):
             self.add_up(self.impulse_sums, (row * self.manipulators + m) * 3 + i, ti.cast(value[i], ti.f64))
 
@@ -107,8 +106,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def moments(self, grid: ti.template(), node, w: ti.template()):
-        """Sum of w g over a particle's stencil in a gathered grid, and of w g times the node's offset (0, 1,
-        2) along x, y and z, in registers."""
+        """Sum of w g over a particle's stencil in a gathered grid, and of w g times the node offset (0, 1, 2)
+        along x, y and z, in registers."""
         m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         mx = m0
         my = m0
@@ -135,7 +134,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, e, time):
-        """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
+        """Transfer from grid to particle: v, C and x after the substep; ``time`` is recorded if the speed is
+        implausible."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         w = spline(fx)
@@ -157,8 +157,8 @@ class CudaPhases(OrderPhases, PosePhases):
     def gather_particle_adjoint(
         self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e
     ):
-        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``. Returns its
-        adjoint, row by row."""
+        """Adjoint of both transfers of one particle, for x and v in ``bar`` and A in ``affine``. Returns the
+        adjoint of A, row by row."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)
@@ -209,7 +209,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def has_law(self, p: ti.template(), number: ti.template()):
-        """Return True if a particle with coefficients ``p`` has the law of a number."""
+        """Return True if a particle with coefficients ``p`` has the law with a given number."""
         if ti.static(len(self.laws) > 1):
             return p[self.coefficients] == ti.cast(number, self.real)
         else:
@@ -217,7 +217,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
-        """Material update of one particle, whose new F is stored if ``update``; returns A, row by row."""
+        """Update the material of one particle, and store the new F if ``update``; return A, row by row."""
         out = ti.Vector.zero(self.real, 9)
         p = self.parameters_of_particle(e, source, lane)
         for number in ti.static(range(len(self.laws))):
@@ -250,7 +250,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def material_particle_adjoint(
         self, state: ti.template(), source, bar: ti.template(), target, a_bar: ti.template(), lane, e
     ):
-        """Adjoint of :meth:`material_particle`, given that of A."""
+        """Adjoint of :meth:`material_particle`, given the adjoint of A."""
         p = self.parameters_of_particle(e, source, lane)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(p, number):
@@ -284,7 +284,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def accumulate_material(self, row, bars: ti.template()):
-        """Add to a material's adjoint, shared by all threads of an environment."""
+        """Add to a material's adjoint, which all threads of an environment share."""
         for i in ti.static(range(len(bars))):
             self.add_up(self.material_sums, row * self.coefficients + i, ti.cast(bars[i], ti.f64))
 
@@ -292,8 +292,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def near_block(self, w, e, s, block):
-        """Bit mask of the manipulators within reach of a block. Each lane of the warp tests one
-        manipulator."""
+        """Bit mask of the manipulators within reach of a block; each lane of the warp tests one."""
         mask, lane = 0, w % WARP
         for shape, start, stop in ti.static(self.shape_ranges):
             if lane >= start and lane < stop:
@@ -305,7 +304,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def touching(self, e, s, x, near):
-        """Bit mask of the manipulators with nonzero contact at a point in substep s; with many manipulators
+        """Bit mask of the manipulators with nonzero contact at a point in substep s. With many manipulators,
         only those in the mask ``near`` are tested."""
         mask = 0
         for shape, start, stop in ti.static(self.shape_ranges):
@@ -322,18 +321,18 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):
-        """Add to a frame's adjoint; ``grid_index`` is the substep of an environment."""
+        """Add to a frame's adjoint; ``grid_index`` identifies environment and substep."""
         at = (grid_index * self.manipulators + m) * FRAME_ADJOINT + entry
         self.add_up(self.frame_sums, at, ti.cast(value, ti.f64))
 
     @ti.func
     def accumulate_world(self, grid_index, e, entry, value):
-        """Add to an adjoint of an environment's frictions and gravity."""
+        """Add to an adjoint of an environment's friction or gravity."""
         self.add_up(self.world_sums, e * (WORLD + self.manipulators) + entry, ti.cast(value, ti.f64))
 
     @ti.func
     def take_world(self, e):
-        """Add the contributions of an environment step to the adjoints of frictions and gravity."""
+        """Add the contributions of an environment step to the adjoints of friction and gravity."""
         for entry in range(WORLD + self.manipulators):
             at = e * (WORLD + self.manipulators) + entry
             self.world_bar[e, entry] += self.take_sum(self.world_sums, at)
@@ -344,7 +343,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def retreat_through(
         self, e, start: ti.template(), m, actions: ti.template(), actions_bar: ti.template(), t
     ):
-        """Adjoint of one manipulator's motion in all substeps of environment step t, from the results of
+        """Backpropagate one manipulator's motion in all substeps of environment step t from the results of
         :meth:`share_frame`."""
         bar = self.pose_bar[e, m]
         u = self.substep_motion(e, start, m, actions, t)
@@ -359,7 +358,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def share_frame(self, e, start: ti.template(), m, s):
-        """Share the adjoint of a substep's frame out to the poses around it, and clear it."""
+        """Distribute the adjoint of a substep's frame to the adjacent poses, and clear it."""
         frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
         for i in ti.static(range(FRAME_ADJOINT)):
             at = ((e * self.substeps + s) * self.manipulators + m) * FRAME_ADJOINT + i
@@ -370,20 +369,20 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def add_measure(self, e, number: ti.template(), value):
-        """Add to an environment's sum of a term of nodes, or of a term of particles: these come behind."""
+        """Add to an environment's sum of a node term or a particle term; particle terms come last."""
         count = ti.static(len(self.node_terms) + len(self.particle_terms))
         self.add_up(self.measure_sums, e * count + number, value)
 
     @ti.func
     def take_material(self, row):
-        """Add the contributions accumulated in an environment step to the adjoint of a material."""
+        """Add the contributions of an environment step to the adjoint of a material."""
         for i in ti.static(range(self.coefficients)):
             self.material_bar[row, i] += self.take_sum(self.material_sums, row * self.coefficients + i)
 
     @ti.func
     def reduce_distances(self, e, m, group):
         """Reduce the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator, then over the
-        lanes of a warp; all lanes of a warp must take part."""
+        lanes of a warp; all of them must take part."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
         for k, _column, term in ti.static(self.distance_terms):
             accumulator = term.start()
@@ -400,8 +399,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def own_particle(self, q, parts: ti.template()):
-        """Environment and number of the particle of thread q if ``parts`` warps share the particles of a tile
-        in contiguous parts; and whether the thread has one."""
+        """Return environment and number of thread q's particle, with ``parts`` warps sharing the particles of
+        a tile in contiguous parts, and whether the thread has a particle."""
         share = ti.static((WARP + parts - 1) // parts)
         unit, place = q // WARP, q % WARP + q // WARP % parts * share
         e, particle = self.particle_of(unit // parts * WARP + ti.min(place, WARP - 1))
@@ -409,10 +408,10 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def sorted_particle(self, state: ti.template(), slot, q, parts: ti.template()):
-        """Particle of thread q when its warp's part of a tile, see :meth:`own_particle`, is sorted by base
-        node; all lanes of a warp must take part.
+        """Return thread q's particle when its warp's part of a tile, see :meth:`own_particle`, is sorted by
+        base node; all lanes of a warp must take part.
 
-        Returns environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and
+        Returns environment, tile, entry of the tile, lane, position, base node, x / dx - base, and
         the base node's grid index, or a distinct negative index without a particle.
         """
         e, particle, own = self.own_particle(q, parts)
@@ -463,7 +462,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def scatter_thread(self, state: ti.template(), before, after, q, time, stamp, parts: ti.template()):
-        """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part.
+        """Update and scatter a particle of thread q's tile; all lanes of a warp must take part. ``time`` is
+        recorded if a value exceeds the range of the integers.
 
         ``time`` is recorded if a value is outside the range of the integers.
         """
@@ -488,8 +488,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def scatter_mass_thread(self, q, e, base, fx, node, stamp):
-        """Add the mass of thread q's particle to its 27 nodes as :meth:`scatter_mass` does; all lanes of a
-        warp take part."""
+        """Add the mass of thread q's particle to its 27 nodes, as :meth:`scatter_mass` does; all lanes of a
+        warp must take part."""
         first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
@@ -502,7 +502,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def grid_thread(self, w, q, s):
-        """Grid update of node q of the active blocks by thread w; the node's momentum is cleared."""
+        """Update node q of the active blocks in thread w, and clear the node's momentum."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         unit = self.momentum_scale(-1)
@@ -518,8 +518,8 @@ class CudaPhases(OrderPhases, PosePhases):
     def scatter_thread_adjoint(
         self, state: ti.template(), bar: ti.template(), before, after, q, stamp, parts: ti.template()
     ):
-        """Scatter of a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes
-        of a warp take part."""
+        """Scatter a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes of
+        a warp must take part."""
         e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q, parts)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
@@ -544,8 +544,7 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def grid_thread_adjoint(self, w, q, s):
-        """Grid update of node q of the active blocks by thread w, and its adjoint; the scattered sums are
-        cleared."""
+        """Update node q of the active blocks in thread w, with its adjoint, and clear the scattered sums."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         i = self.node_of_block(block, r)
@@ -587,7 +586,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def gather_thread_adjoint(
         self, state: ti.template(), bar: ti.template(), before, after, q, parts: ti.template()
     ):
-        """Adjoint of both transfers and of the material, for thread q's own particle."""
+        """Adjoint of both transfers and the material for thread q's particle."""
         e, particle, own = self.own_particle(q, parts)
         if own:
             tile = particle // self.lanes
@@ -602,8 +601,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):
-        """Terms of a particle of a thread's tile, and its distances from the moving manipulators; all lanes
-        of a warp take part."""
+        """Compute the terms of a particle of the thread's tile, and its distances from moving manipulators;
+        all lanes of a warp must take part."""
         if ti.static(len(self.particle_terms) > 0):
             values = ti.Vector.zero(ti.f64, ti.static(len(self.particle_terms)))
             if counts:
@@ -623,8 +622,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def node_terms_thread(self, w, q):
-        """Compute the terms of node q of the active blocks in thread w, and write mass and the slope of the
-        loss to the node."""
+        """Compute the terms of node q of the active blocks in thread w, and write mass and the derivative of
+        the loss to the node."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         unit = self.momentum_scale(-1)
@@ -642,7 +641,7 @@ class CudaPhases(OrderPhases, PosePhases):
         if w % WARP == 0:
             for c in ti.static(range(len(self.node_terms))):
                 self.add_measure(e, c, part[c])
-            # Most are below a peak seen already.
+            # Most values are below an earlier peak.
             if part[last] > self.node_part[e, 0][last]:
                 ti.atomic_max(self.node_part[e, 0][last], part[last])
 

@@ -45,13 +45,13 @@ LEAST_EXPONENT = -80
 
 
 def atomic(name: str, kind: Any) -> Callable[..., None]:
-    """Return a function of ``cuda_global.ll`` for numbers of a type."""
+    """Return a function of ``cuda_global.ll`` for a number type."""
     return bitcode_function(bitcode_file("cuda", "", "atomics"), symbol("atomics", name, TYPE_SUFFIXES[kind]))
 
 
 @ti.func
 def add(kind: ti.template(), address, value):
-    """Add to a number at an address, without returning the old value."""
+    """Add to the number at an address, without returning the old value."""
     place, number = ti.cast(address, ti.u64), ti.cast(value, kind)
     ti.static(atomic("add", kind))(place, number)
 
@@ -82,10 +82,10 @@ def gather_sums(
     q: ti.template(),
     h: ti.template(),
 ):
-    """Return sums over the stencil of a particle for its adjoint, given the addresses of its base node in the
-    grids of velocities and of the momentum adjoint p: sums of w p and of w p times the node's offset (0, 1,
-    2) along x, y and z, 3 components each, and the sum of grad_f w (p . q + velocity . h), for affine fields
-    ``q`` and ``h`` (value at the base node and increments along x, y, z)."""
+    """Return sums over a particle's stencil for its adjoint, given the addresses of its base node in the
+    grids of velocities and of the momentum adjoint p: sums of w p and of w p times the node offset (0, 1,
+    2) along x, y and z (3 components each), and the sum of grad_f w (p . q + velocity . h) for affine
+    fields ``q`` and ``h`` (value at the base node, then increments along x, y, z)."""
     v, p, n = ti.u64(velocity), ti.u64(momentum), ti.i64(axis)
     weights = variables(real, [w[k][i] for k in range(3) for i in range(3)])
     slopes = variables(real, [dw[k][i] for k in range(3) for i in range(3)])
@@ -100,17 +100,17 @@ class SumPhases(Storage):
     """Atomic sums; integer sums in a deterministic simulator.
 
     Attributes:
-        adjoint_bound: Upper bound on contributions to a node's adjoint, by environment; see :meth:`bits_of`.
+        adjoint_bound: Upper bound on contributions to a node's adjoint by environment; see :meth:`bits_of`.
     """
 
     adjoint_bound: ti.Field
 
     def scattered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_grid` adds to it."""
+        """Allocate a grid of 4-vectors for :meth:`add_to_grid`."""
         return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
 
     def sums(self, count: int) -> ti.Field:
-        """Allocate ``count`` sums in float64, all 0, for :meth:`add_up` and :meth:`take_sum`."""
+        """Allocate ``count`` zero-initialised float64 sums for :meth:`add_up` and :meth:`take_sum`."""
         if self.deterministic:
             return ti.field(ti.i64, shape=count * (len(WORD_UNITS) + 1))
         return ti.field(ti.f64, shape=count)
@@ -155,18 +155,18 @@ class SumPhases(Storage):
 
     @property
     def node_bytes(self) -> int:
-        """Bytes of a node of a grid that is scattered to."""
+        """Bytes per node of a scattered grid."""
         return 16 if self.real == ti.f32 and not self.deterministic else 32
 
     @ti.func
     def node_at(self, first, node):
-        """Return the address of a node of a scattered grid that begins at the address ``first``."""
+        """Return the address of a node of a scattered grid that begins at address ``first``."""
         # In 64 bits: 32 count the nodes of many environments, but not their numbers.
         return first + ti.static(self.node_bytes) * ti.cast(node, ti.u64)
 
     @ti.func
     def add_to_grid(self, corner, number, component, value, scale: ti.template()):
-        """Add to a number of a grid that is scattered to, counted from that at an address, ``corner``.
+        """Add to a component of a scattered grid, indexed relative to the address ``corner``.
 
         ``scale`` is a 4-vector with the number of units per 1, from :meth:`momentum_scale` or
         :meth:`adjoint_scale`.
@@ -179,7 +179,7 @@ class SumPhases(Storage):
 
     @ti.func
     def momentum_scale(self, power: ti.template()):
-        """Number of units of momentum (3) and mass per 1, or for ``power`` -1 the inverse, 4-vector."""
+        """Units of momentum (3) and mass per 1, as a 4-vector; the inverse for ``power`` -1."""
         exponent = ti.static(-math.floor(math.log2(self.mass)))
         momentum = ti.cast(ti.static(2.0 ** (power * (MOMENTUM_BITS + exponent))), self.real)
         mass = ti.cast(ti.static(2.0 ** (power * (MASS_BITS + exponent))), self.real)
@@ -187,8 +187,8 @@ class SumPhases(Storage):
 
     @ti.func
     def adjoint_scale(self, e, power: ti.template()):
-        """Number of units of a node's adjoint per 1 in an environment, or for ``power`` -1 the inverse, as a
-        constant 4-vector; the inverse is non-finite if an adjoint is."""
+        """Units of a node's adjoint per 1 in an environment, as a constant 4-vector; the inverse for
+        ``power`` -1, non-finite if an adjoint is."""
         number = ti.cast(1.0, ti.f32)
         if ti.static(self.deterministic):
             bits = self.adjoint_bound[e]
@@ -209,6 +209,6 @@ class SumPhases(Storage):
 
     @ti.func
     def bits_of(self, bound):
-        """Return the bits of a nonnegative float32: their order is that of the numbers, followed by infinity
-        and NaN."""
+        """Return the bits of a nonnegative float32, which sort like the numbers, followed by infinity and
+        NaN."""
         return ti.bit_cast(ti.cast(bound, ti.f32), ti.i32) & 0x7FFFFFFF

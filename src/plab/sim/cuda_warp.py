@@ -76,7 +76,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     particle_threads: int
 
     def gathered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid that particles gather from: :meth:`node4` reads, :meth:`put_nodes` writes it."""
+        """Allocate a grid that particles gather from, read by :meth:`node4` and written by
+        :meth:`put_nodes`."""
         if self.real == ti.f32:
             return ti.field(ti.i64, shape=2 * nodes)
         return super().gathered_grid(nodes)
@@ -108,17 +109,17 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def turns_of(self, w, threads, total):
-        """Return the number of ``total`` items that thread w of some threads works on."""
+        """Return how many of ``total`` items thread w processes."""
         return (total - w + threads - 1) // threads
 
     @ti.func
     def nodes_in(self, counter: ti.template()):
-        """Number of nodes of the blocks counted in ``counter``, over all environments."""
+        """Number of nodes in the blocks counted by ``counter``, over all environments."""
         return counter[0] << NODE_BITS
 
     @ti.func
     def node_of(self, q):
-        """Environment, block and number in the block of node q of the active blocks."""
+        """Environment, block and index within the block of node q of the active blocks."""
         entry = self.block_list[q >> NODE_BITS]
         e = entry // self.blocks
         return e, entry - e * self.blocks, q & NODE_MASK
@@ -136,9 +137,9 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
-        """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
-        of shared memory; the numbers ``r`` of the warp's nodes in the block are consecutive from a multiple
-        of 32. ``unit`` has the units of the components, see :meth:`add_to_grid`."""
+        """Read and clear 32 nodes, one per lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers of
+        shared memory. The warp's node indices ``r`` in the block are consecutive, starting at a multiple
+        of 32; ``unit`` has the units of the components, see :meth:`add_to_grid`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         # Read all before writing, so that the device waits once instead of four times.
@@ -161,7 +162,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def put_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, value):
-        """Write a 4-vector for each lane of a warp to a gathered grid, as :meth:`take_nodes` reads."""
+        """Write a 4-vector per lane of a warp to a gathered grid, in the layout of :meth:`take_nodes`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for c in ti.static(range(4)):
@@ -184,7 +185,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def wide_from_above(self, value, offset):
-        """The float64 of the lane ``offset`` above this one."""
+        """Return the float64 of the lane ``offset`` above this one."""
         bits = ti.bit_cast(value, ti.i64)
         low = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), offset)
         high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
@@ -207,8 +208,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def sorted_lane(self, state: ti.template(), source, place, own, lane):
-        """Return the particle of a lane when the particles of a tile, one at the ``place`` of each lane with
-        ``own``, are sorted by base node; and whether the lane has one."""
+        """Sort the particles of a tile by base node, one at the ``place`` of each lane with ``own``; return
+        the lane's particle, and whether it has one."""
         base, _fx = self.stencil(self.vector(state, source, place))
         node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.
@@ -226,7 +227,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def run_heads(self, key, taking_part, lane):
-        """The runs of neighbouring lanes with the same key in a warp. Either all lanes of a run take part or
+        """Find runs of neighbouring lanes with equal keys in a warp. Either all lanes of a run take part or
         none, and participating lanes come first.
 
         Returns whether this is the first lane of a run that takes part, a bit for each lane that is, and how
@@ -288,7 +289,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 rows[own + 3 * plane + 3 * i + j] = w[i][1] * w[j][2]
         self.wait_for_warp()
         # A lane is a column of three nodes along z with one of three components, and one of these nodes with
-        # the fourth component. Lanes beyond the last do as that does.
+        # the fourth component. Lanes beyond the last repeat its work.
         place = ti.cast(ti.min(lane, 26), ti.u32)
         i, j = ti.cast(place // 9, ti.i32), ti.cast(place // 3 % 3, ti.i32)
         k = ti.cast(place % 3, ti.i32)
@@ -355,7 +356,7 @@ class OrderPhases(WarpPhases):
     """
 
     def allocate_order(self) -> None:
-        """Allocate the fields for sorting, once."""
+        """Allocate the fields for sorting."""
         if hasattr(self, "cell_count"):
             return
         self.cell_count = ti.field(ti.i32, shape=self.batch * self.nodes)
@@ -364,7 +365,7 @@ class OrderPhases(WarpPhases):
 
     @ti.func
     def mark_shared(self, e, base, stamp):
-        """Note that a particle touches the blocks around a node."""
+        """Record that a particle touches the blocks around a node."""
         block, crossing = self.block_of(base)
         for corner in ti.static(range(8)):
             if (crossing & corner) == corner:
@@ -456,7 +457,7 @@ class OrderPhases(WarpPhases):
         t,
         q,
     ):
-        """Fetch the state at thread q's place in the order of step t."""
+        """Load the state at thread q's place in the order of step t."""
         e, place = self.particle_of(q)
         origin = moves[t * self.particle_threads + q]
         read = self.tile_entry(source_slot, e, origin // self.lanes)
@@ -468,13 +469,13 @@ class OrderPhases(WarpPhases):
     def move(
         self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32, moves: Array, t: ti.i32
     ):
-        """Permute the states of a time slot to the order of step t, into another slot or array."""
+        """Permute the states of a time slot into the order of step t, to another slot or array."""
         for q in range(self.particle_threads):
             self.move_particle(source, source_slot, target, target_slot, moves, t, q)
 
     @ti.kernel
     def move_back(self, source: Array, target: Array, moves: Array, t: ti.i32):
-        """Permute adjoints from the order of step t to the previous one, into another array."""
+        """Permute adjoints from the order of step t into the previous one, to another array."""
         for q in range(self.particle_threads):
             e, place = self.particle_of(q)
             origin = moves[t * self.particle_threads + q]

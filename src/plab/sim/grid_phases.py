@@ -1,4 +1,5 @@
-"""Grid phases of a substep: gravity, contact with the manipulators, Coulomb friction, walls; adjoints."""
+"""Grid phases of a substep and their adjoints: gravity, contact with manipulators, Coulomb friction and
+walls."""
 
 import math
 
@@ -74,14 +75,14 @@ class GridPhases(Storage):
 
     @ti.func
     def node_of_block(self, block, r):
-        """Array index (3) of node r of a block."""
+        """Array index (3) of the r-th node of a block."""
         nb = self.blocks_per_axis
         corner = ti.Vector([block // (nb * nb), (block // nb) % nb, block % nb]) * BLOCK
         return corner + ti.Vector([r // (BLOCK * BLOCK), (r // BLOCK) % BLOCK, r % BLOCK])
 
     @ti.func
     def linear(self, i):
-        """Linear index of a node within one grid from its array index."""
+        """Linear index of a node in its grid, from its array index."""
         return (i[0] * self.axis + i[1]) * self.axis + i[2]
 
     @ti.func
@@ -90,7 +91,7 @@ class GridPhases(Storage):
 
     @ti.func
     def strength(self, e, d):
-        """Contact strength at distance d; 0 where contact is not applied."""
+        """Contact strength at distance d; 0 beyond the contact range."""
         alpha = self.alpha[e]
         s = d * 0.0
         if d <= 0.0:
@@ -130,7 +131,7 @@ class GridPhases(Storage):
 
     @ti.func
     def into_frame(self, shape: ti.template(), e, s, m, v):
-        """A world vector in manipulator m's frame."""
+        """Convert a world vector to manipulator m's frame."""
         out = v
         if ti.static(self.rotated(shape)):
             out = self.frame_rotation[e, s, m].transpose() @ v
@@ -138,7 +139,7 @@ class GridPhases(Storage):
 
     @ti.func
     def out_of_frame(self, shape: ti.template(), e, s, m, v):
-        """A vector of manipulator m's frame in the world."""
+        """Convert a vector from manipulator m's frame to the world."""
         out = v
         if ti.static(self.rotated(shape)):
             out = self.frame_rotation[e, s, m] @ v
@@ -175,7 +176,7 @@ class GridPhases(Storage):
 
     @ti.func
     def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):
-        """Adjoint of v under :meth:`contact`; the frame's adjoint is accumulated."""
+        """Adjoint of v under :meth:`contact`; accumulates the frame's adjoint."""
         out = bar
         offset = x - self.frame_centre[e, s, m]
         p = self.into_frame(shape, e, s, m, offset)
@@ -238,8 +239,8 @@ class GridPhases(Storage):
 
     @ti.func
     def wall_free(self, i, v, value, axis: ti.template()):
-        """A velocity or adjoint at a node, without its component along an axis where the velocity ``v`` leads
-        into one of the frictionless walls."""
+        """Velocity or adjoint at a node, with components zeroed along axes where ``v`` points into a
+        frictionless wall."""
         out = value
         node = i[axis] - 1
         if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
@@ -248,7 +249,7 @@ class GridPhases(Storage):
 
     @ti.func
     def floor(self, v, friction):
-        """Velocity after the floor, for a floor node with v_y < 0."""
+        """Velocity after contact with the floor, for a floor node with v_y < 0."""
         out = v * 0.0
         if friction < STICKING:
             t = with_friction(ti.Vector([v[0], v[2]]), v[1], friction)
@@ -268,7 +269,7 @@ class GridPhases(Storage):
 
     @ti.func
     def has_floor_friction(self, i, v, friction):
-        """Return True if floor friction acts on a node."""
+        """Return True if a node is subject to floor friction."""
         return friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
 
     @ti.func
@@ -316,7 +317,7 @@ class GridPhases(Storage):
 
     @ti.func
     def after_manipulators(self, e, s, x, v, near, count):
-        """Velocity of a node after contact with those of the first ``count`` manipulators that are near."""
+        """Velocity of a node after contact with the nearby manipulators among the first ``count``."""
         out = v
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, ti.min(stop, count)):
@@ -346,8 +347,8 @@ class GridPhases(Storage):
 
     @ti.func
     def update_node(self, row, e, s, i, near, total):
-        """Velocity of a node at the end of the grid update, from its momentum and mass; impulses are added to
-        the sums of a row."""
+        """Velocity of a node after the grid update, from its momentum and mass; adds impulses to the sums of
+        a row."""
         v = ti.Vector([0.0 * total[0], 0.0 * total[0], 0.0 * total[0]])
         if total[3] > MASS_MIN:
             v = self.free_velocity(e, total)
@@ -360,7 +361,7 @@ class GridPhases(Storage):
 
     @ti.func
     def update_node_adjoint(self, grid_index, e, s, i, near, total, bar):
-        """Grid update of a node together with its adjoint.
+        """Update a grid node and compute the adjoint of the update.
 
         Returns:
             Velocity (3), and the adjoint of momentum and mass (4) given the velocity's adjoint ``bar``. The

@@ -1,4 +1,4 @@
-"""Memory of a simulation: estimates before allocation, limits of indices, and allocated bytes.
+"""Memory of a simulation: estimates before allocation, index limits and allocated bytes.
 
 Estimates are lower bounds, used to reject scenes that cannot fit and to choose the sizes of batches and
 checkpoints.
@@ -52,7 +52,7 @@ def _nodes(scene: Scene) -> int:
 
 def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None:
     """Raise SceneError unless scenes of equal size fit into one simulator; the message states the largest
-    number."""
+    number that fits."""
     count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
     numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
     if not numbered:
@@ -70,14 +70,13 @@ def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None
 
 
 def most_environments(scene: Scene, precision: str, device: str) -> int:
-    """Return the number of environments that fit into half of a device's memory without a gradient; at least
-    1."""
+    """Return how many environments fit into half of a device's memory without a gradient, at least 1."""
     room = min(device_bytes(device) / 2, 1e15)
     return max(1, int(room // environment_bytes(scene, precision, device)))
 
 
 def kept_states(steps: int, slots_per_step: int, length: int, reach: int) -> int:
-    """Return the number of states stored for a gradient with segments of ``length`` environment steps.
+    """Return the number of stored states for a gradient with segments of ``length`` environment steps.
 
     These are all states of one segment, in arrays of ``reach`` steps with an additional state at the start,
     the first state of every other segment, and one more.
@@ -143,7 +142,7 @@ def device_bytes(device: str) -> float:
     limits = [math.inf]
     if hasattr(os, "sysconf"):
         limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
-    # Limit of a container or a cluster job; the file may be missing or contain "max".
+    # Memory limit of a container or a cluster job; the file may be missing or contain "max".
     for file in ("memory.max", "memory/memory.limit_in_bytes"):
         try:
             limits.append(float((Path("/sys/fs/cgroup") / file).read_text(encoding="ascii")))

@@ -1,4 +1,4 @@
-"""Rigid motion of the manipulators: poses, their frames of contact, and adjoints.
+"""Rigid motion of manipulators: poses, contact frames and adjoints.
 
 A pose is 8 numbers: position (3), unit quaternion w, x, y, z (4), gap (1). One substep applies 1 / substeps
 of the motion of an environment step's action. Adjoints are written by hand, because they are only a few
@@ -35,7 +35,7 @@ def conjugate(q):
 
 @ti.func
 def quat_from_rotvec(w):
-    """Quaternion of a rotation vector: (cos(|w|/2), sin(|w|/2) w/|w|), smooth at 0."""
+    """Quaternion (cos(|w|/2), sin(|w|/2) w/|w|) of a rotation vector, smooth at 0."""
     h2 = 0.25 * w.dot(w)
     s, _ds, c = half_angle(h2)
     return vec4(c, 0.5 * s * w[0], 0.5 * s * w[1], 0.5 * s * w[2])
@@ -43,7 +43,7 @@ def quat_from_rotvec(w):
 
 @ti.func
 def half_angle(h2):
-    """sin(h)/h, its derivative with respect to h^2, and cos(h), from h^2 >= 0."""
+    """sin(h)/h, its derivative with respect to h^2, and cos(h), given h^2 >= 0."""
     s = 1.0 - h2 / 6.0 + h2 * h2 / 120.0 - h2 * h2 * h2 / 5040.0
     ds = -1.0 / 6.0 + h2 / 60.0 - h2 * h2 / 1680.0
     c = 1.0 - h2 / 2.0 + h2 * h2 / 24.0 - h2 * h2 * h2 / 720.0
@@ -90,7 +90,7 @@ def rotation_matrix(q):
 
 @ti.func
 def rotation_matrix_adjoint(q, m):
-    """Adjoint of the quaternion under :func:`rotation_matrix`, given the adjoint m (3x3) of the matrix."""
+    """Adjoint of the quaternion under :func:`rotation_matrix`, given the matrix adjoint m (3x3)."""
     return 2.0 * vec4(
         q[1] * (m[2, 1] - m[1, 2]) + q[2] * (m[0, 2] - m[2, 0]) + q[3] * (m[1, 0] - m[0, 1]),
         q[0] * (m[2, 1] - m[1, 2])
@@ -216,7 +216,7 @@ def quaternion(pose):
 
 
 class PosePhases(Storage):
-    """Poses within one environment step and the frames in which contact is computed.
+    """Poses within one environment step, and the frames in which contact is computed.
 
     Shape-dependent code is compiled for each of the ``shape_ranges``: ``start`` is the first of those that
     manipulator ``m`` is in.
@@ -224,14 +224,14 @@ class PosePhases(Storage):
 
     @ti.func
     def action_of(self, e, start: ti.template(), m, t):
-        """Return the index of manipulator m's first number among the actions of all environments."""
+        """Return the index of manipulator m's first component in the flat actions of all environments."""
         own = ti.static(self.action_offsets[start]) + (m - start) * ti.static(self.action_dims[start])
         return (t * self.batch + e) * self.actions_per_step + own
 
     @ti.func
     def substep_motion(self, e, start: ti.template(), m, actions: ti.template(), t):
-        """Motion of manipulator m per substep, from its action, clipped and scaled if required by the
-        shape."""
+        """Motion of manipulator m per substep from its action, clipped and scaled if its shape requires
+        it."""
         u = vec7(0.0)
         entry = self.action_of(e, start, m, t)
         for i in ti.static(range(self.action_dims[start])):
@@ -243,7 +243,7 @@ class PosePhases(Storage):
 
     @ti.func
     def given_pose(self, poses: ti.template(), slot, e, m):
-        """Manipulator m's pose in slot ``slot`` of the pose history."""
+        """Return manipulator m's pose in slot ``slot`` of the pose history."""
         pose = vec8(0.0)
         for i in ti.static(range(8)):
             pose[i] = poses[((slot * self.batch + e) * self.manipulators + m) * 8 + i]
@@ -258,8 +258,8 @@ class PosePhases(Storage):
     def advance_manipulator(
         self, e, start: ti.template(), m, actions: ti.template(), poses: ti.template(), t, before, after
     ):
-        """Poses of one manipulator in all substeps of environment step t, from slot ``before`` of the pose
-        history to slot ``after``."""
+        """Compute the poses of one manipulator in all substeps of environment step t, from slot ``before`` of
+        the pose history to slot ``after``."""
         if m == 0 and self.touched[e] == 0:
             self.untouched_step[e] = t
         pose = self.given_pose(poses, before, e, m)
@@ -290,8 +290,8 @@ class PosePhases(Storage):
 
     @ti.func
     def set_frame(self, e, s, m):
-        """Centre, rotation and rates of a manipulator in substep s; the rates are differences taken in
-        float64."""
+        """Compute centre, rotation and rates of a manipulator in substep s; the rates are float64
+        differences."""
         start = self.pose[e, s, m]
         end = self.pose[e, s + 1, m]
         r0 = rotation_matrix(quaternion(start))
@@ -307,8 +307,8 @@ class PosePhases(Storage):
 
     @ti.func
     def retreat_pose(self, e, start: ti.template(), m, s, u, bar):
-        """Adjoints of the pose at the start of substep s and of its motion u, given that of the pose at its
-        end."""
+        """Adjoints of the pose at the start of substep s and of its motion u, given the adjoint of the pose
+        at its end."""
         pose = self.pose[e, s, m]
         return advance_pose_adjoint(
             self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m], bar

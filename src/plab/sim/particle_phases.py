@@ -1,4 +1,5 @@
-"""Particle phases of a substep common to both devices: state access, stencils, material by singular values.
+"""Particle phases of a substep common to both devices: state access, stencils, and the material update by
+singular values.
 
 Transfers between a particle and its 27 grid nodes use quadratic B-splines and fields that are affine around
 the particle (APIC, moving least squares). Such a field is a 4-vector at the base node and three increments,
@@ -40,28 +41,27 @@ def spline_slope(f):
 
 @ti.func
 def widen(v: ti.template(), last):
-    """A 3-vector and a scalar as a 4-vector."""
+    """Concatenate a 3-vector and a scalar to a 4-vector."""
     return ti.Vector([v[0], v[1], v[2], last])
 
 
 @ti.func
 def column(a: ti.template(), j: ti.template(), scale):
-    """Column j of a row-major 3x3 tuple, scaled, as a 4-vector with 0 at the end."""
+    """Column j of a row-major 3x3 tuple, scaled, as a 4-vector padded with 0."""
     return ti.Vector([scale * a[j], scale * a[3 + j], scale * a[6 + j], 0.0 * a[j]])
 
 
 @ti.func
 def at_base(value, row: ti.template(), f: ti.template(), scale):
-    """One component of an affine field at the base node, from its value at the particle and its row of the
-    matrix A; ``scale`` is the factor of A times the grid spacing. For numbers or lanes."""
+    """One component of an affine field at the base node, given its value at the particle and its row of the
+    matrix A; ``scale`` is the factor of A times the grid spacing. Takes numbers or lanes."""
     return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
 
 
 @ti.func
 def affine_field(value, last, a: ti.template(), f, scale):
-    """An affine field, as value at the base node and increments, from its value (3) at the particle, the
-    fourth entry at the base node, and the matrix A (9); ``scale`` is the factor of A times the grid
-    spacing."""
+    """Affine field as value at the base node and increments, given its value (3) at the particle, its fourth
+    entry at the base node, and the matrix A (9); ``scale`` is the factor of A times the grid spacing."""
     base = [at_base(value[i], [a[3 * i], a[3 * i + 1], a[3 * i + 2]], f, scale) for i in range(3)]
     return [widen(base, last), column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
 
@@ -90,7 +90,7 @@ class ParticlePhases(Storage):
         return bitcode_function(path, symbol(part, name, TYPE_SUFFIXES[real] if real else precision))
 
     def scheduled(self, number: int) -> bool:
-        """Return True if a law has a special schedule, with singular values outside the range of its
+        """Return True if a law has a special schedule, which uses singular values outside the range of its
         series."""
         return self.laws[number] is LAWS["von_mises"]
 
@@ -107,7 +107,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def particle_of(self, q):
-        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
+        """Environment and number of thread q's particle; numbers at or above ``particles`` are padding."""
         e = q // (self.tiles * self.lanes)
         return e, q - e * (self.tiles * self.lanes)
 
@@ -121,12 +121,12 @@ class ParticlePhases(Storage):
 
     @ti.func
     def lane_in(self, field: ti.template(), entry, lane):
-        """Address of a particle's number in a lane vector of a field."""
+        """Address of a particle's component in a lane vector of a field."""
         return ti.get_addr(field, [entry]) + ti.u64(lane * ti.static(BYTES[self.real]))
 
     @ti.func
     def lane_of(self, state_at, entry, lane):
-        """Address of a particle's number in a lane vector of an array that begins at ``state_at``."""
+        """Address of a particle's component in a lane vector of an array that begins at ``state_at``."""
         return state_at + ti.u64(entry * self.lanes + lane) * ti.static(BYTES[self.real])
 
     @ti.kernel
@@ -170,8 +170,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def stencil(self, x):
-        """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5), in the
-        lowest half cell of the release's floor in [0, 0.5).
+        """Array index of the base node along each axis, and the offset x / dx - base, in [0.5, 1.5), or in
+        [0, 0.5) in the lowest half cell under the release's floor.
 
         The index is clamped so that not even a NaN leads out of the grid.
         """
@@ -207,7 +207,7 @@ class ParticlePhases(Storage):
     @ti.func
     def parameters_of_tile(self, e: ti.template(), entry9: ti.template()):
         """Coefficients of a tile's particles, as numbers, or as lanes if bodies differ, with law numbers if
-        there are several; ``entry9`` is the tile's in ``affine``."""
+        there are several laws; ``entry9`` is the tile's entry in ``affine``."""
         if ti.static(self.mixed):
             first = entry9 // 9 * ti.static(self.place_rows)
             return [self.place_material[first + i] for i in range(self.place_rows)]
@@ -216,7 +216,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def parameters_of_particle(self, e: ti.template(), entry: ti.template(), lane: ti.template()):
-        """As :meth:`parameters_of_tile`, for one particle; ``entry`` is its tile's, of any time slot."""
+        """Coefficients of one particle, as :meth:`parameters_of_tile`; ``entry`` is its tile's entry in any
+        time slot."""
         if ti.static(self.mixed):
             first = self.place_of(entry) * ti.static(self.place_rows)
             return [self.place_material[first + i][lane] for i in range(self.place_rows)]
@@ -225,7 +226,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def place_of(self, entry):
-        """Number of a tile among those of all environments, from its first entry in a state of any time
+        """Number of a tile among the tiles of all environments, given its first entry in a state of any time
         slot."""
         return entry // STATE % (self.batch * self.tiles)
 
@@ -237,7 +238,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
-        """Update of one particle under von Mises plasticity by singular values; returns A, row by row."""
+        """Update one particle under von Mises plasticity by singular values; return A, row by row."""
         p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + AT_C, lane, 9))
         f = as_matrix(self.load(state, source + AT_F, lane, 9))
@@ -261,7 +262,7 @@ class ParticlePhases(Storage):
         e,
         grid_index,
     ):
-        """Adjoint of :meth:`spectral_material`, given that of A."""
+        """Adjoint of :meth:`spectral_material`, given the adjoint of A."""
         p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + AT_C, lane, 9))
         f = as_matrix(self.load(state, source + AT_F, lane, 9))
@@ -287,12 +288,13 @@ class ParticlePhases(Storage):
 
     @ti.func
     def block_along(self, base):
-        """Block of a base node along an axis, and 1 if its stencil reaches the next block, otherwise 0."""
+        """Block of a base node along an axis, and 1 if its stencil extends into the next block, otherwise
+        0."""
         return base >> BLOCK_BITS, ((base & (BLOCK - 1)) + 2) >> BLOCK_BITS
 
     @ti.func
     def block_of(self, base):
-        """Linear index of the block of a base node, and the axes along which its stencil reaches the next
+        """Linear index of a base node's block, and the axes along which its stencil extends into the next
         block (3 bits)."""
         b, crosses = self.block_along(base)
         block = (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2]

@@ -1,4 +1,4 @@
-"""Particles of all environments on the device: their state in tiles, and their order in memory.
+"""Particles of all environments on the device: state in tiles, and order in memory.
 
 Initially the order follows a Hilbert curve through the grid, so that particles close in memory share grid
 nodes, also after the plasticine has moved and deformed. With many particles on CUDA they are sorted by cell
@@ -129,7 +129,7 @@ class Particles:
         self.reset_order()
 
     def reset_order(self, environments: Sequence[int] | None = None) -> None:
-        """Return to the initial order, of all environments or of some."""
+        """Restore the initial order of all or some environments."""
         if self._changed and environments is None:
             copy_numbers(self.numbers, 0, self._start, self.places, 1)
             self._changed = False
@@ -140,7 +140,7 @@ class Particles:
                 copy_numbers(self.numbers, first, self._start[first : first + own], own, 1)
 
     def order(self) -> np.ndarray:
-        """Return the order at present, shape [batch, particle]."""
+        """Return the current order, shape [batch, particle]."""
         out = np.zeros(self.places, np.int32)
         copy_numbers(self.numbers, 0, out, self.places, 0)
         return out.reshape(self.engine.batch, -1)[:, : self.engine.particles].astype(np.int64)
@@ -156,8 +156,8 @@ class Particles:
     def sort(
         self, state: ti.Ndarray, slot: int, to: ti.Ndarray, to_slot: int, t: int, moves: ti.Ndarray | None
     ) -> None:
-        """Sort a state by cell into another array or time slot, and make this the current order; ``moves``,
-        by default an own array for step 0, is written for step t."""
+        """Sort a state by cell into another array or time slot, and make this the current order. ``moves``,
+        by default an array for step 0, is written for step t."""
         t, moves = (0, self._moves) if moves is None else (t, moves)
         stamp, after = self.new_stamps(1), self._spare_numbers
         self.engine.sort(state, slot, to, to_slot, self.numbers, after, moves, t, stamp)
@@ -203,7 +203,8 @@ class Particles:
         t: int,
         entries: tuple[int, int],
     ) -> None:
-        """Environment step t from a time slot of ``state``, by ``stride`` slots per substep (0: in place)."""
+        """Run environment step t from a time slot of ``state``, advancing by ``stride`` slots per substep (0:
+        in place)."""
         stamp = self.new_stamps(self.engine.substeps)
         self.engine.step(state, poses, actions, slot, stride, t, *entries, stamp)
 
@@ -228,8 +229,8 @@ class Particles:
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
     def unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray | None = None) -> State:
-        """Convert the tiles of one state to user arrays, with poses; ``order``, shape [batch, particle], is
-        by default the current order."""
+        """Convert the tiles of one state to user arrays, with poses; ``order``, shape [batch, particle],
+        defaults to the current order."""
         engine = self.engine
         b, n = engine.batch, engine.particles
         order = self.order() if order is None else order

@@ -37,11 +37,11 @@ written."""
 
 
 class DeviceError(PlabError, RuntimeError):
-    """The requested device is not available; the message states the remedy."""
+    """Unavailable device; the message states the remedy."""
 
 
 class SimulationError(PlabError, RuntimeError):
-    """State or gradient became non-finite; the message states the environment and the time.
+    """Non-finite state or gradient; the message states the environment and the time.
 
     Attributes:
         failures: Diverged environments, with time and reason.
@@ -114,7 +114,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     _refuse_fork()
     # Taichi can create fields only in the thread that initialised it, and aborts in others.
     if _thread not in (None, threading.get_ident()):
-        raise RuntimeError("create all environments and simulators in one thread, that of the first")
+        raise RuntimeError("create all environments and simulators in one thread")
     _thread = threading.get_ident()
     if device not in DEVICES:
         raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")
@@ -188,7 +188,7 @@ def remove_stale_cache_lock() -> None:
 
 
 def cuda_driver() -> ctypes.CDLL | None:
-    """Return the initialised CUDA driver; None if there is none."""
+    """Return the initialised CUDA driver, or None."""
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -204,7 +204,7 @@ def cuda_devices() -> int:
 
 
 def in_use() -> Runtime | None:
-    """Return the runtime of existing simulators; None without any."""
+    """Return the runtime of existing simulators, or None."""
     return _current if len(_users) > 0 else None
 
 
@@ -214,17 +214,17 @@ def register_user(user: object) -> None:
 
 
 def own_fields(owner: object) -> None:
-    """Place the fields just declared on the CPU; they are freed before the next simulator is built if their
-    owner is gone by then."""
+    """Place the fields just declared on the CPU; if their owner no longer exists when the next simulator is
+    built, they are freed then."""
     if _current is not None and _current.device == "cpu" and (handle := place_fields()) is not None:
         weakref.finalize(owner, _dropped.append, (_current, handle)).atexit = False
 
 
 def is_current(runtime: Runtime) -> bool:
-    """Return True if a runtime is still the active one.
+    """Return True if a runtime is still active.
 
     Raises:
-        RuntimeError: If this process was forked from the one that has started it.
+        RuntimeError: If this process was forked from the one that started it.
     """
     _refuse_fork()
     return runtime is _current

@@ -1,4 +1,4 @@
-"""Signed distances of manipulators in their own frames, with normals and Hessian products.
+"""Signed distances of manipulators in their own frames, with normals and Hessian-vector products.
 
 :data:`SURFACES` has the functions of each shape of :data:`plab.scenes.MANIPULATOR_SHAPES`. All distances are
 exact, so normals have length 1, as required by the broad phase.
@@ -53,7 +53,8 @@ def ball_hessian_product(q, w):
 
 @ti.func
 def rod_hessian_product(q, w):
-    """Hessian of the distance from a segment of the y axis times w; q is relative to its nearest point."""
+    """Hessian-vector product of the distance from a segment of the y axis; q is relative to its nearest
+    point."""
     masked = w
     # Along the straight part the distance does not depend on y.
     if q[1] == 0.0:
@@ -63,7 +64,7 @@ def rod_hessian_product(q, w):
 
 @ti.func
 def on_segment(p, low, high):
-    """p relative to the nearest point of the segment of the y axis from low to high."""
+    """p relative to the nearest point of the segment from low to high on the y axis."""
     return ti.Vector([p[0], p[1] - ti.min(ti.max(p[1], low), high), p[2]])
 
 
@@ -104,8 +105,7 @@ def stick_point(p, size, gap):
 
 @ti.func
 def chopsticks_distance(p, size, gap):
-    """Two capsules along local -y, with length size[0], radius size[1] and axes at the distance of the
-    gap."""
+    """Two capsules along local -y of length size[0] and radius size[1], whose axes are the gap apart."""
     return ball(stick_point(p, size, gap), size[1])
 
 
@@ -116,7 +116,7 @@ def chopsticks_hessian_product(p, size, gap, w):
 
 @ti.func
 def chopsticks_gap_slope(p):
-    """Derivative of :func:`stick_point`'s x with respect to the gap."""
+    """Derivative of the x coordinate of :func:`stick_point` with respect to the gap."""
     return -0.5 * nearer_stick(p)
 
 
@@ -176,7 +176,7 @@ def box_hessian_product(p, size, _gap, w):
 
 @ti.func
 def planar(axial, radial_x, radial_z):
-    """Radius in the xz plane, guarded, and the unit radial direction."""
+    """Guarded radius in the xz plane, and the unit radial direction."""
     rho = ti.sqrt(radial_x * radial_x + radial_z * radial_z)
     safe = ti.max(rho, 1e-12)
     return rho, safe, ti.Vector([radial_x / safe, 0.0 * axial, radial_z / safe])
@@ -184,7 +184,7 @@ def planar(axial, radial_x, radial_z):
 
 @ti.func
 def revolved(m, radial):
-    """Normal of a body of revolution from its profile's, m."""
+    """Normal of a body of revolution, given its profile's normal m."""
     n = m[0] * radial
     n[1] = m[1]
     return n
@@ -192,7 +192,7 @@ def revolved(m, radial):
 
 @ti.func
 def revolved_hessian_product(m, h, safe, radial, w):
-    """Hessian product of a body of revolution from its profile's normal m and Hessian product h."""
+    """Hessian-vector product of a body of revolution, given its profile's normal m and product h."""
     tangent = ti.Vector([-radial[2], 0.0 * safe, radial[0]])
     out = h[0] * radial + m[0] / safe * tangent.dot(w) * tangent
     out[1] = h[1]
@@ -250,7 +250,7 @@ SURFACES |= {name: SURFACES[kind.outline] for name, kind in MANIPULATOR_SHAPES.i
 
 
 def require_surfaces(shapes: Iterable[str]) -> None:
-    """Raise SceneError if a shape has no surface, or a gripper has no derivative with respect to its gap."""
+    """Raise SceneError if a shape has no surface, or a gripper no derivative with respect to its gap."""
     for shape in shapes:
         surface = SURFACES.get(shape)
         if surface is None or (MANIPULATOR_SHAPES[shape].grips and surface.gap_slope is None):
@@ -265,7 +265,7 @@ def signed_distance(shape: ti.template(), p, size, gap):
 
 @ti.func
 def hessian_product(shape: ti.template(), p, size, gap, w):
-    """Hessian of the distance of a shape times w, in its own frame; arguments as in :class:`Surface`."""
+    """Hessian-vector product of a shape's distance in its own frame; arguments as in :class:`Surface`."""
     return SURFACES[shape].hessian_product(p, size, gap, w)
 
 

@@ -1,4 +1,4 @@
-"""Simulator of a batch of environments: settings, steps, rollouts and their gradients."""
+"""Batched simulator: settings, steps, rollouts and their gradients."""
 
 from __future__ import annotations
 
@@ -156,9 +156,9 @@ class Simulator:
         return held_bytes(self, engine, *engine.terms, self._particles, self._tape)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Refuse copying and pickling, with TypeError."""
+        """Raise TypeError: simulators cannot be copied or pickled."""
         raise TypeError(
-            "a simulator cannot be copied or pickled: build another, and set_state(state()) there"
+            "a simulator cannot be copied or pickled: build another one and call set_state(state()) on it"
         )
 
     # -- settings -----------------------------------------------------------------------------------
@@ -357,11 +357,11 @@ class Simulator:
             require_none(broken_states(faults, self.substeps, self._taken))
 
     def measure(self, like: torch.Tensor | None = None) -> Measures:
-        """Return loss terms and soft IoU of the current state; CUDA tensors of the same type if ``like`` is
-        one.
+        """Return loss terms and soft IoU of the current state; if ``like`` is a CUDA tensor, so are the
+        results.
 
         Raises:
-            SimulationError: If the last step, made with ``check=False``, has diverged.
+            SimulationError: If the last step, made with ``check=False``, diverged.
         """
         self._require_runtime()
         if on_device(like):
@@ -416,7 +416,7 @@ class Simulator:
     def _observe(
         self, state: ti.Ndarray, slot: int, stride: int, like: torch.Tensor | None
     ) -> np.ndarray | torch.Tensor:
-        """As :meth:`observe`, for a time slot of an array with particles in the current order."""
+        """Observe a time slot of an array with particles in the current order; see :meth:`observe`."""
         count = -(-self.particle_count // stride)
         size = self.batch * count * 6
 
@@ -431,8 +431,8 @@ class Simulator:
         return self._observed[stride].to_numpy().reshape(self.batch, count, 6)
 
     def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
-        """Return the poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A
-        CUDA tensor of the same type if ``like`` is one."""
+        """Return the poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`.
+        If ``like`` is a CUDA tensor, so is the result."""
         self._require_runtime()
         return numbers_of(self._pose, self._initial_poses.shape, like)
 
@@ -555,8 +555,8 @@ class Simulator:
         mass: bool = True,
         gradient: bool = True,
     ) -> RecordedStates:
-        """Simulate environment steps from the initial state and return the states with their pullback, for
-        losses that the caller computes from states.
+        """Simulate environment steps from the initial state, and return the states with a pullback for losses
+        that the caller computes from them.
 
         Args:
             actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. For a CUDA tensor, the states are
@@ -585,8 +585,8 @@ class Simulator:
         discount: float = 1.0,
         like: torch.Tensor | None = None,
     ) -> np.ndarray | torch.Tensor:
-        """Simulate environment steps with actions chosen from observations, and backpropagate through the
-        states and the policy.
+        """Simulate environment steps with actions chosen from observations, and backpropagate through states
+        and policy.
 
         Args:
             steps: Environment steps T.
@@ -677,7 +677,7 @@ class Simulator:
         return {"floor_friction": bar[:, 0], "gravity": bar[:, 1:WORLD], "friction": bar[:, WORLD:]}
 
     def loss_gradient(self) -> State:
-        """Return the gradient of the weighted loss of the current state with respect to this state, without
+        """Return the gradient of the weighted loss of the current state with respect to that state, without
         simulation.
 
         Gradients with respect to quaternions are as in :meth:`state_gradient`.
@@ -691,7 +691,7 @@ class Simulator:
         return self._adjoint(bar)
 
     def steps_before_contact(self, steps: int) -> int:
-        """Return the number of the last rollout's ``steps`` before the first contact in any environment; 0 if
+        """Return how many of the last rollout's ``steps`` precede the first contact in any environment; 0 if
         the full gradient is requested."""
         if self._engine.full_gradient:
             return 0
@@ -704,8 +704,7 @@ class Simulator:
     def _started(
         self, actions: np.ndarray | torch.Tensor, gradient: bool
     ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
-        """Reset; return actions, number of steps, pose history, and the number of steps per segment with a
-        gradient."""
+        """Reset; return actions, number of steps, pose history, and steps per segment of a gradient."""
         self.reset()
         through = (lambda given: self._follow(given, gradient).twists) if self._map else None
         array = kernel_actions(actions, self._engine, self.action_dim, through, rollout=True)
@@ -731,7 +730,7 @@ class Simulator:
         return (bar.to(like.dtype) if on_device(bar) else bar).swapaxes(0, 1)
 
     def _judged(self, values: np.ndarray | torch.Tensor) -> Measures:
-        """Convert measures of shape [..., batch, measure] to loss terms and soft IoU; see
+        """Convert measures, shape [..., batch, measure], to loss terms and soft IoU; see
         :class:`plab.sim.term_phases.TermPhases`."""
         terms = self._engine.terms
         peak = values[..., len(terms)]
@@ -752,7 +751,7 @@ class Simulator:
     def _start_positions(
         self, scenes: Sequence[Scene], particles: Sequence[np.ndarray] | None
     ) -> list[np.ndarray]:
-        """Return checked initial positions, sampled from the scenes if None are given."""
+        """Return checked initial positions, sampled from the scenes if ``None`` is given."""
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
         given = map(sample_particles, scenes) if particles is None else particles

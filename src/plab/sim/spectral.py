@@ -1,10 +1,10 @@
-"""The material update by singular values, for strains outside the range of the series in
+"""Material update by singular values, for strains outside the range of the series in
 :mod:`plab.laws.von_mises`.
 
 Used for few particles (strong compression, inverted or nearly singular F, stiff materials that do not yield)
 and designed for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the smallest
 singular value carries the sign of det F) and a derivative in divided differences with their limits. Material
-parameters are called as there, matrices are 3x3.
+parameters have the same names as there; matrices are 3x3.
 """
 
 from plab.laws.von_mises import NORM_SHIFT
@@ -117,8 +117,8 @@ def svd_signed(f):
 
 @ti.func
 def mapped_values(s, mu, lam, yield_strain):
-    """Return mapping of singular values: returns the new values g, eigenvalues of tau, clamped Hencky
-    strains, factor k of their deviator, and |dev|."""
+    """Map singular values to the yield surface; return the new values g, the eigenvalues of tau, the clamped
+    Hencky strains, the factor k of their deviator, and |dev|."""
     e = s * 0.0
     for i in ti.static(range(3)):
         e[i] = ti.log(ti.max(s[i], SINGULAR_VALUE_MIN))
@@ -221,7 +221,7 @@ def spectral_parameter_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strai
 
 @ti.func
 def divided_difference(sa, sb, ga, gb, k, tiny):
-    """(g_b - g_a) / (s_b - s_a), at its limit where the two singular values are equal."""
+    """(g_b - g_a) / (s_b - s_a), or its limit if the two singular values are equal."""
     out = 1.0 + 0.0 * sa
     if k < 1.0:
         ca = ti.max(sa, SINGULAR_VALUE_MIN)

@@ -63,7 +63,7 @@ class Rollout:
         step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
             [batch, T, action], or None without ``gradient``.
-        failures: Diverged environments, with time and reason. Their numbers are meaningless; the other
+        failures: Diverged environments, with time and reason. Their values are meaningless; the other
             environments are not affected.
     """
 
@@ -79,9 +79,9 @@ class Rollout:
 
 
 def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int = 1) -> dict[int, str]:
-    """Return the diverged environments with the time of divergence, from the numbers of the substeps in which
-    they diverged, shape [batch], counted from 1 in environment step ``first``, or 0. A CUDA tensor is fetched
-    only if any environment has diverged."""
+    """Return the diverged environments with the time of divergence, given the substep in which each diverged,
+    shape [batch], counted from 1 in environment step ``first``, or 0. A CUDA tensor is copied to the host
+    only if an environment has diverged."""
     if not faults.any():
         return {}
     if on_device(faults):

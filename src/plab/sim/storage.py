@@ -6,8 +6,8 @@ CPU and loads coalesce on CUDA. Tile t of environment e at time slot s is entry 
 t) * 24 + component``.
 
 Grids are dense in memory and sparse in use: only blocks of 4^3 nodes with mass are read, written and cleared.
-Array index i along an axis is node i - 1: the layer below the domain is there because particles within dx/2
-of the floor reach it. On the CPU an environment's particles are split into ``chunks`` of consecutive
+Array index i along an axis is node i - 1, because particles within dx/2 of the floor reach the layer of nodes
+below the domain. On the CPU an environment's particles are split into ``chunks`` of consecutive
 particles with a private grid each, so that scattering needs no atomics and its result does not depend on the
 number of threads.
 """
@@ -29,7 +29,7 @@ from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.tensors import Array
 
 STATE = 24
-"""Entries per particle: x (3), v (3), C (9), F (9); the same of a state's adjoint."""
+"""Entries per particle: x (3), v (3), C (9), F (9); likewise in a state's adjoint."""
 
 AT_V = 3
 AT_C = 6
@@ -44,7 +44,7 @@ CHUNKS = 8
 """Private grids per environment on the CPU: a constant, because the order of summation follows from it."""
 
 WORLD = 4
-"""Number of adjoints before those of the manipulators' friction: the floor's friction and gravity (3)."""
+"""Adjoints that precede those of manipulator friction: floor friction and gravity (3)."""
 
 FRAME_ADJOINT = 25
 AT_FRAME_VELOCITY, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_GAP = 3, 6, 15, 24
@@ -96,7 +96,7 @@ PIECE = 1 << 21
 
 
 class Storage:
-    """Fields and constants shared by all phases of a substep; see the module's docstring for the layout."""
+    """Fields and constants shared by all phases of a substep; see the module docstring for the layout."""
 
     def __init__(
         self,
@@ -294,7 +294,7 @@ class Storage:
         """Write the laws of each tile; used by the CPU."""
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
-        """Write all per-environment data, except those of loss terms."""
+        """Write all per-environment data except those of loss terms."""
         self.fill_material(scenes)
         if self.manipulators == 0:
             return
@@ -312,7 +312,7 @@ class Storage:
     # copies have one for each field.
 
     def share(self, field: ti.Field) -> ti.Field:
-        """Register a field and return it, before the first kernel is compiled.
+        """Register a field and return it. Call before the first kernel is compiled.
 
         :meth:`write` takes fields of numbers or vectors with one or two dimensions, :meth:`read` those of
         numbers with one dimension.
@@ -321,11 +321,11 @@ class Storage:
         return field
 
     def write(self, field: ti.Field, values: ArrayLike) -> None:
-        """Write all entries of a shared field, from numbers with the field's leading shape."""
+        """Write all entries of a shared field, given numbers with the field's leading shape."""
         self._copy_field(field, np.asarray(values).reshape(-1), 1)
 
     def read(self, field: ti.Field) -> np.ndarray:
-        """Return all entries of a shared field of numbers and of one dimension."""
+        """Return all entries of a shared one-dimensional field of numbers."""
         out = np.zeros(field.shape)
         self._copy_field(field, out, 0)
         return out
@@ -337,12 +337,12 @@ class Storage:
         for first in range(0, entries, PIECE):
             count = min(PIECE, entries - first)
             piece = numbers[first * size : (first + count) * size]
-            # A copy: kernels take arrays as something that they might write to.
+            # Copy, because kernels may write to their arrays.
             self.copy_entries(which, writes, piece.astype(np.float64) if writes else piece, first, count)
 
     @ti.kernel
     def copy_entries(self, which: ti.i32, writes: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
-        """Write an array to some entries of the shared field of this number, or read them into it."""
+        """Copy an array to some entries of the shared field with this number, or from them."""
         for i in range(count):
             for number, field, size in ti.static(self.shared):
                 if which == number:

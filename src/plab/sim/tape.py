@@ -1,4 +1,4 @@
-"""Rollouts and their backward pass: checkpointed states, recorded states, and closed-loop control."""
+"""Rollouts and their backward pass: state checkpoints, recorded states and closed-loop control."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Tape:
-    """Runs environment steps forward and back.
+    """Forward and backward passes through environment steps.
 
     The steps are divided into segments. In the forward pass only the first state of each segment is stored,
     except for the last segment; the other states are recomputed in the backward pass, in the same particle
@@ -37,7 +37,7 @@ class Tape:
     """
 
     def __init__(self, particles: Particles) -> None:
-        """Allocate nothing yet; :meth:`forward` starts from the particles' current state."""
+        """Allocate nothing; :meth:`forward` starts from the particles' current state."""
         self._particles = particles
         self._engine: Any = particles.engine
         self._history: list[ti.Ndarray] = []
@@ -64,7 +64,7 @@ class Tape:
         return max(0, slots - 1) // self._slots_per_step
 
     def _place(self, t: int) -> tuple[ti.Ndarray, int]:
-        """Array and slot of the history from which step t starts."""
+        """Array and slot of the history that hold the start of step t."""
         number, masked_index = divmod(t % self._length, self._reach)
         return self._history[number], masked_index * self._slots_per_step + (1 if self._engine.sorts else 0)
 
@@ -261,7 +261,7 @@ class RecordedStates:
         self.x, self.v, self.poses, self.mass, self._back = x, v, poses, mass, back
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:
-        """Return the gradient with respect to the actions of a function, given its derivatives with respect
+        """Return the gradient of a function with respect to the actions, given its derivatives with respect
         to the states.
 
         Afterwards, :meth:`plab.sim.Simulator.state_gradient` and :meth:`plab.sim.Simulator.material_gradient`
@@ -298,7 +298,7 @@ class RecordedStates:
 def record(
     simulator: Simulator, actions: Any, every_step: bool, with_mass: bool, gradient: bool
 ) -> RecordedStates:
-    """Simulate and record; arguments, results and errors of :meth:`plab.sim.Simulator.record`."""
+    """Simulate and record; arguments, results and errors as in :meth:`plab.sim.Simulator.record`."""
     engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
     array, steps, poses, plan = simulator._started(actions, gradient)
     drive, first = simulator._drive, 0 if every_step else steps - 1
@@ -308,7 +308,7 @@ def record(
     masses: list[Any] = []
 
     def filled(size: int, fill: Callable[[Any], None]) -> Any:
-        """Return zeros that a kernel has added to, as an array or a tensor, shape [batch, number]."""
+        """Return an array or a tensor of zeros, shape [batch, number], to which a kernel has added."""
         double = engine.real == ti.f64
         if on_device(actions):
             return output_for(lambda out: fill(out.zero_()), size, double, actions).reshape(engine.batch, -1)
@@ -340,7 +340,7 @@ def record(
     def back(bars: dict[str, Any]) -> Any:
         if not gradient or simulator._version != version:
             raise RuntimeError(
-                "there is no gradient: record with gradient=True, and pull back before it runs again"
+                "there is no gradient: record with gradient=True, and pull back before the next simulation"
             )
         by_step = {name: [_flat(bar[:, k]) for k in range(bar.shape[1])] for name, bar in bars.items()}
 
@@ -380,7 +380,8 @@ def closed_loop(
     discount: float,
     like: torch.Tensor | None,
 ) -> np.ndarray | torch.Tensor:
-    """Simulate forward and back; arguments, results and errors of :meth:`plab.sim.Simulator.closed_loop`."""
+    """Simulate and backpropagate; arguments, results and errors as in
+    :meth:`plab.sim.Simulator.closed_loop`."""
     simulator._require_runtime()
     engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
     row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
@@ -398,7 +399,7 @@ def closed_loop(
         return drives[-1].twists
 
     def observe(t: int, state: ti.Ndarray, slot: int) -> None:
-        """Observe the state before step t, and choose the actions of this step."""
+        """Observe the state before step t, and choose the actions of that step."""
         numbers.append(particles.noted_order())
         posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
         chosen = choose(t, simulator._observe(state, slot, stride, like), posed)
@@ -408,8 +409,8 @@ def closed_loop(
             copy_numbers(actions, t * row, given, row, 1)
 
     def react_at(t: int) -> tuple[Any, Any] | None:
-        """Return the derivatives with respect to the observation before step t from the adjoint of its
-        actions, or those of the last observation."""
+        """Return the derivatives with respect to the observation before step t, or the last observation,
+        given the adjoint of its actions."""
         nonlocal joints_bar
         if t == steps:
             return react(t, None)

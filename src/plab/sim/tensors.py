@@ -30,8 +30,7 @@ def on_device(array: object) -> "TypeIs[torch.Tensor]":
 
 
 class Constants:
-    """Constants that are combined with arrays and CUDA tensors in every step; they are copied to the device
-    only once."""
+    """Constants that are combined with arrays and CUDA tensors in every step, copied to the device once."""
 
     def __init__(self, values: ArrayLike) -> None:
         """Store numbers of any shape."""
@@ -49,8 +48,8 @@ class Constants:
 
 @ti.kernel
 def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, writes: ti.i32):
-    """Write numbers to an array from its entry ``first`` on, or read them. All arrays share one kernel,
-    because loading a kernel takes a tenth of a second on CUDA."""
+    """Copy numbers to or from an array, starting at its entry ``first``. All arrays share one kernel, because
+    loading a kernel takes a tenth of a second on CUDA."""
     for i in range(count):
         if writes != 0:
             array[first + i] = numbers[i]
@@ -59,7 +58,7 @@ def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, wri
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
-    """Return a new tensor of ``count`` numbers on the device and of the type of a CUDA tensor, filled by the
+    """Return a new tensor of ``count`` numbers with the device and type of a CUDA tensor, filled by the
     kernel that ``fill`` launches, in float64 if ``double``."""
     torch = sys.modules["torch"]
     out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
@@ -69,7 +68,7 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
 
 
 def fill_tensor(out: "torch.Tensor", fill: Callable[[Any], None]) -> None:
-    """Fill a new CUDA tensor by the kernel that ``fill`` launches, whatever PyTorch's stream."""
+    """Fill a new CUDA tensor by the kernel that ``fill`` launches, in any PyTorch stream."""
     if _in_default_stream():
         fill(out)
     else:
@@ -82,7 +81,7 @@ def fill_tensor(out: "torch.Tensor", fill: Callable[[Any], None]) -> None:
 def numbers_of(
     array: ti.Ndarray, shape: tuple[int, ...], like: object, first: int = 0
 ) -> "np.ndarray | torch.Tensor":
-    """Copy entries of a device array, from entry ``first`` on, to an array of the given shape, or to a tensor
+    """Copy entries of a device array, starting at ``first``, to an array of the given shape, or to a tensor
     like the CUDA tensor ``like``."""
     count = int(np.prod(shape))
     if on_device(like):
@@ -141,13 +140,13 @@ def kernel_actions(
 def _numbers(
     actions: "np.ndarray | torch.Tensor", expected: tuple[int | None, ...]
 ) -> "np.ndarray | torch.Tensor":
-    """Return the actions as a flat float64 array, ordered by step if ``expected`` leaves the number of steps
+    """Return the actions as a flat float64 array, ordered by step if the number of steps in ``expected`` is
     open (None). CUDA tensors are complete on return. Raise ArgumentError for wrong shapes and non-finite
     actions."""
     try:
         actions = actions.detach() if on_device(actions) else np.asarray(actions, np.float64)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"actions must be numbers of one shape: {error}") from None
+        raise ArgumentError(f"actions must form a numeric array: {error}") from None
     shape = tuple(actions.shape)
     if len(shape) != len(expected) or any(n not in (None, m) for n, m in zip(expected, shape, strict=True)):
         named = "(batch, components)" if None not in expected else "(batch, steps, components)"
@@ -155,7 +154,7 @@ def _numbers(
         raise ArgumentError(f"actions have shape {shape}, not ({wanted}) {named}")
     if None in expected:
         if not shape[1]:
-            raise ArgumentError("actions have no steps: give one at least, shape (batch, steps, components)")
+            raise ArgumentError("actions have no steps: pass at least one, shape (batch, steps, components)")
         actions = actions.swapaxes(0, 1)
     if on_device(actions):
         flat = actions.reshape(-1).double().contiguous()

@@ -4,10 +4,9 @@ adjoints with respect to particles and poses.
 The terms are defined in :mod:`plab.losses`, as objects with a few functions that are compiled into these
 kernels.
 
-The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to
-the layer below the domain counts at the face's node, so that the tensor holds all mass. The release's floor
-knows no such layer: there, particles near a lower face have negative weights, and nodes may have negative
-masses.
+The mass tensor has n^3 nodes; the mass that particles near a lower face spread to the layer below the domain
+is added to the face's node, so that the tensor holds all mass. The release's floor has no such layer:
+particles near a lower face have negative weights, and nodes may have negative masses.
 """
 
 from collections.abc import Sequence
@@ -43,14 +42,14 @@ class LossTerm(Protocol):
 
 
 class TermPhases(Storage):
-    """The mass tensor, and sums of terms.
+    """The mass tensor, and sums of loss terms.
 
     Attributes:
         shares: Number of groups of particles in the reduction of distances.
         terms: The terms, in the order of their measures.
-        node_terms: Those of the mass tensor: number among these, column among the measures, term.
-        particle_terms: Those of the particles, likewise.
-        distance_terms: Those of the distances.
+        node_terms: Terms of the mass tensor: index among these, column among the measures, term.
+        particle_terms: Terms of the particles, likewise.
+        distance_terms: Terms of the distances, likewise.
         references: Fields of the targets requested by terms, by name.
     """
 
@@ -61,7 +60,7 @@ class TermPhases(Storage):
     distance_terms: tuple[tuple[int, int, Any], ...] = ()
 
     def attach(self, terms: Sequence[LossTerm]) -> None:
-        """Attach the terms, before the first kernel is compiled.
+        """Attach the terms. Call before the first kernel is compiled.
 
         Args:
             terms: Terms as in :mod:`plab.losses.term`, not attached before; those of weight 0 are left out.
@@ -85,7 +84,7 @@ class TermPhases(Storage):
             term.attach(self)
 
     def _with(self, hook: str) -> tuple[tuple[int, int, Any], ...]:
-        """Terms of the kind with a hook: number among their kind, column among the measures, term."""
+        """Terms that have a hook: index among their kind, column among the measures, term."""
         kind = [(column, term) for column, term in enumerate(self.terms) if hasattr(term, hook)]
         return tuple((number, *pair) for number, pair in enumerate(kind))
 
@@ -110,7 +109,7 @@ class TermPhases(Storage):
 
     @ti.func
     def scatter_mass(self, grid_index, base, fx):
-        """Add one particle's mass to its 27 nodes, where one thread owns the grid."""
+        """Add one particle's mass to its 27 nodes, in a grid that one thread owns."""
         w = spline(fx)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
@@ -135,8 +134,8 @@ class TermPhases(Storage):
 
     @ti.func
     def mass_slope(self, slopes: ti.template(), e, base, fx, dense: ti.template()):
-        """Gradient of the node terms with respect to one particle's position, from the slopes at the nodes:
-        in a grid, or n^3 numbers per environment (``dense``)."""
+        """Gradient of the node terms with respect to one particle's position, given the derivatives at the
+        nodes, in a grid or as n^3 numbers per environment (``dense``)."""
         w = spline(fx)
         dw = spline_slope(fx)
         out = fx * 0.0
@@ -162,8 +161,8 @@ class TermPhases(Storage):
 
     @ti.func
     def node_measures(self, e, i, mass):
-        """Return the shares of a node, by its array index, in the terms of the mass tensor, followed by its
-        mass; and the slope of the loss there."""
+        """Return a node's contributions to the terms of the mass tensor, followed by its mass, and the
+        derivative of the loss with respect to its mass; takes the node's array index."""
         values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         slope = 0.0 * mass
         node = i - 1
@@ -230,8 +229,8 @@ class TermPhases(Storage):
 
     @ti.func
     def distance_adjoint(self, k: ti.template(), shape: ti.template(), e, m, particle, x):
-        """Adjoints of a particle's position and of a manipulator's pose (8-vector) under the k-th term of
-        distances, weighted."""
+        """Adjoints of a particle's position and a manipulator's pose (8-vector) under the k-th distance term,
+        weighted."""
         _number, column, term = ti.static(self.distance_terms[k])
         pose = self.pose[e, self.substeps, m]
         gap = ti.cast(pose[7], self.real)
@@ -260,7 +259,7 @@ class TermPhases(Storage):
 
     @ti.func
     def nearest_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
-        """Add the gradient of terms of the nearest particle to its adjoint and those of the poses."""
+        """Add the gradient of nearest-particle terms to the adjoints of that particle and the poses."""
         for k, _column, term in ti.static(self.distance_terms):
             if ti.static(term.nearest_only):
                 for shape, start, stop in ti.static(self.shape_ranges):
@@ -291,14 +290,14 @@ class TermPhases(Storage):
 
     @property
     def beyond_nearest(self) -> bool:
-        """Return True if a term of distances has a gradient for more than the nearest particle."""
+        """Return True if a distance term has a gradient for more than the nearest particle."""
         return any(not term.nearest_only for _k, _column, term in self.distance_terms)
 
     # -- all terms ----------------------------------------------------------------------------------
 
     @ti.func
     def join_measures(self, e, terms: ti.template(), at):
-        """Join the parts of an environment's reductions, and write its measures from entry ``at``."""
+        """Combine the partial reductions of an environment, and write its measures from entry ``at``."""
         part = self.node_part[e, 0]
         sums = self.particle_part[e, 0]
         last = ti.static(len(self.node_terms))
@@ -331,8 +330,8 @@ class TermPhases(Storage):
 
     @ti.kernel
     def add_cotangents(self, bar: Array, order: Array, given: Array, first: ti.i32):
-        """Add derivatives with respect to positions (``first`` is 0) or velocities (3), in the order
-        ``order``, to the particle adjoints."""
+        """Add derivatives with respect to positions (``first`` = 0) or velocities (``first`` = 3), in the
+        order ``order``, to the particle adjoints."""
         for q in range(self.batch * self.tiles * self.lanes):
             e, place = self.particle_of(q)
             if place < self.particles:

@@ -1,1 +1,1 @@
-"""Functions for the simulator as LLVM bitcode: the laws and their adjoints, and sums over grid nodes."""
+"""LLVM bitcode for the simulator: constitutive laws and their adjoints, and sums over grid nodes."""

@@ -1,4 +1,4 @@
-"""Files of LLVM bitcode that Taichi links into its kernels, written when first needed.
+"""LLVM bitcode files that Taichi links into its kernels, written on first use.
 
 A file contains the functions of the transfers or of one law, for one device and one precision. Its name in
 plab's cache folder contains a digest of its sources. Taichi identifies compiled kernels by these names, so
@@ -46,7 +46,7 @@ PLATFORM = f"{sys.platform}-{platform.machine().lower()}"
 
 @functools.cache
 def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = False) -> str:
-    """Return the path of a bitcode file, which is written if it does not exist.
+    """Return the path of a bitcode file; write the file if it does not exist.
 
     Args:
         device: ``cpu`` or ``cuda``.
@@ -97,7 +97,7 @@ def _temporary() -> Path:
 
 @functools.cache
 def _sources() -> bytes:
-    """Return a digest of the sources of bitcode: plab's own files and llvmlite."""
+    """Return a digest of the bitcode sources: plab's own files and llvmlite."""
     folders = Path(__file__).parent, Path(laws.__file__).parent
     files = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix in (".py", ".ll")]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
@@ -107,7 +107,7 @@ def _sources() -> bytes:
 
 
 def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
-    """Return the bitcode of a file."""
+    """Return the bitcode of a file as bytes."""
     if device == "cpu" and PLATFORM not in LAYOUTS:
         raise _unsupported(
             f"plab's simulator has no data layout for {PLATFORM}: it runs on {', '.join(LAYOUTS)}"

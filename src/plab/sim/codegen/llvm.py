@@ -1,4 +1,4 @@
-"""Functions in LLVM's intermediate representation, written by tracing operators of numbers.
+"""Code generation in LLVM's intermediate representation, by tracing arithmetic operators.
 
 A :class:`Number` is a value of all lanes of a tile on the CPU, or of one particle on CUDA. Products and sums
 may be fused, which Taichi does not allow on CPUs.
@@ -23,7 +23,7 @@ LANE = LANES["cpu"]
 WORD = ir.IntType(64)
 
 Row = tuple[ir.Value, ir.Value]
-"""Twelve numbers: 4-vectors of the nodes 0 and 1 along z as one vector of eight, and that of node 2."""
+"""Twelve numbers: the 4-vectors of nodes 0 and 1 along z as one vector of eight, and that of node 2."""
 
 
 class Code:
@@ -37,7 +37,7 @@ class Code:
     def __init__(
         self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str, *, grid: bool = True
     ) -> None:
-        """Begin a function with named arguments: addresses, optionally a grid's nodes per axis, and
+        """Begin a function with named arguments: addresses, optionally the grid's nodes per axis, and
         numbers."""
         self.real = real
         self.single = isinstance(real, ir.FloatType)
@@ -111,7 +111,7 @@ class Code:
         return self.add(self.mul(n, self.constant(high)), rest)
 
     def _ln2(self) -> tuple[float, float]:
-        """ln 2 as the sum of a term with few digits, for exact products with small integers, and a
+        """ln 2 as a leading term with few digits, whose products with small integers are exact, plus a
         remainder."""
         bits = 15 if self.single else 32
         high = math.ldexp(math.floor(math.ldexp(math.log(2.0), bits)), -bits)
@@ -137,7 +137,7 @@ class Code:
         return self._b.call(known or ir.Function(self._b.module, kind, name), [a])
 
     def constant(self, number: float) -> ir.Value:
-        """A number in all lanes."""
+        """A constant in all lanes."""
         return ir.Constant(ir.VectorType(self.real, LANE), [self.real(number)] * LANE)
 
     def below(self, a: ir.Value, b: ir.Value, *, equal: bool = False) -> ir.Value:
@@ -170,7 +170,7 @@ class Code:
         return self._b.select(self._b.fcmp_ordered(">", a, b), a, b)
 
     def inside(self, y: ir.Value, end: ir.Value, value: ir.Value) -> ir.Value:
-        """A value if y is in [0, end] or NaN, otherwise 0."""
+        """``value`` if y is in [0, end] or NaN, otherwise 0."""
         low = self._b.fcmp_ordered("<", y, self.real(0.0))
         out = self._b.or_(low, self._b.fcmp_ordered(">", y, end))
         return self._b.select(out, self.real(0.0), value)
@@ -187,7 +187,7 @@ class Code:
         return self._b.mul(a, b)
 
     def lane(self, pointer: ir.Value, entry: int) -> ir.Value:
-        """A particle's number in an entry of lane vectors."""
+        """Address of a particle's component in an entry of lane vectors."""
         return self._b.load(self.at(pointer, entry * LANE), align=self._align)
 
     def lanes(self, pointer: ir.Value, first: int, count: int = 3, step: int = 1) -> list[ir.Value]:
@@ -243,12 +243,12 @@ class Code:
         return operation(*(row[0] for row in rows)), operation(*(row[1] for row in rows))
 
     def times(self, row: Row, factor: ir.Value, to: Row | None = None) -> Row:
-        """A row times a number, added to another."""
+        """Row times a number, added to another row."""
         product = self.both(self.mul, row, (self.splat(factor, 8), self.splat(factor, 4)))
         return product if to is None else self.both(self.add, to, product)
 
     def read(self, pointer: ir.Value) -> Row:
-        """The row of a grid that begins at an address."""
+        """Grid row that begins at an address."""
         return self._b.load(self._wide(pointer, 8), align=self._align), self._b.load(
             self._wide(self.at(pointer, 8), 4), align=self._align
         )
@@ -262,7 +262,7 @@ class Code:
 
 
 class Scalars(Code):
-    """A function of the numbers of one particle, with parts that may be skipped at run time."""
+    """A function on the numbers of one particle, with parts that may be skipped at run time."""
 
     def constant(self, number: float) -> ir.Value:
         return self.real(number)
@@ -292,7 +292,7 @@ class Scalars(Code):
         return [self._b.load(place) for place in places]
 
     def node(self, pointer: ir.Value, number: int) -> list[Number]:
-        """The four numbers of a node of a grid, counted from that at an address."""
+        """The four numbers of a grid node, counted from the node at an address."""
         kind = ir.PointerType(ir.VectorType(self.real, 4), addrspace=1)
         place = self._b.inttoptr(self._b.ptrtoint(self.at(pointer, 4 * number), WORD), kind)
         row = self._b.load(place, align=16)
@@ -300,7 +300,7 @@ class Scalars(Code):
 
 
 class Number:
-    """A vector of lanes, or one number; each operator emits an instruction."""
+    """A vector of lanes or one number; each operator emits an instruction."""
 
     def __init__(self, code: Code, value: ir.Value) -> None:
         self.code, self.value = code, value
@@ -348,12 +348,12 @@ class Number:
         return self._operation("below", other, self)
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number | float) -> Any:
-        """NumPy's functions of numbers."""
+        """Apply NumPy's elementwise functions."""
         own = OPERATORS.get(function)
         return own(*given) if own else self._operation(_NAMES[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Number:
-        """:func:`numpy.where`; other NumPy functions of arrays are not supported."""
+        """Implement :func:`numpy.where`; other NumPy functions of arrays are not supported."""
         assert function is np.where
         return self._operation("chosen", *given)
 

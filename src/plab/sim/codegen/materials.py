@@ -34,7 +34,8 @@ Maker = Callable[[ir.Module, str, ir.Type], None]
 
 
 def scattered_matrix(tau: Sequence[Any], c: Sequence[Any], stress_scale: Any, mass: Any) -> list[Any]:
-    """A = stress_scale tau + mass C, which a particle scatters, from a symmetric tau (6) and a full C (9)."""
+    """A = stress_scale tau + mass C, the matrix that a particle scatters, for symmetric tau (6) and full C
+    (9)."""
     return [stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + mass * c[i] for i in range(9)]
 
 
@@ -48,13 +49,13 @@ def pulled_back(
     bars: Sequence[Any],
     known: Sequence[Any] = (),
 ) -> list[Any]:
-    """Return the adjoints of the numbers ``given`` from those of a function's results, ``bars``.
+    """Return the adjoints of the numbers ``given``, from the adjoints ``bars`` of a function's results.
 
     Args:
-        function: From the numbers given and those that are ``fixed``, two lists, to results and intermediate
+        function: Maps two lists, ``given`` and ``fixed`` numbers, to results and intermediate
             results.
         given: Numbers with adjoints.
-        fixed: Numbers without.
+        fixed: Numbers without adjoints.
         bars: Adjoints of the results.
         known: Values of the intermediate results.
     """
@@ -76,8 +77,8 @@ def law_adjoint(
     a_bar: Sequence[Any],
     f_bar: Sequence[Any],
 ) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return the adjoints of C (9), F (9) and the coefficients from those of A (9) and of the new F (9);
-    ``constants`` are the time step, the scale of the stress in A, and the mass."""
+    """Return the adjoints of C (9), F (9) and the coefficients, given the adjoints of A (9) and the new F
+    (9); ``constants`` are the time step, the scale of the stress in A, and the mass."""
 
     def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
         dt, scale, mass = fixed
@@ -89,7 +90,7 @@ def law_adjoint(
 
 
 class TracedSeries(algebra.Series):
-    """The series, with the exact derivative of J^(-2/3) instead of differentiated Newton steps."""
+    """The series, with the exact derivative of J^(-2/3) in place of differentiated Newton steps."""
 
     def unimodular_scale(self, j: Any) -> Any:
         own = algebra.Series.unimodular_scale
@@ -105,8 +106,8 @@ def stress_adjoint(
     scale: Any,
     series: Any,
 ) -> tuple[list[Any], Any, Any, list[Any]]:
-    """Return the contributions of the stress to the adjoints of d (6), c2, J and the parameters (3), from the
-    adjoint of A (9)."""
+    """Return the contributions of the stress to the adjoints of d (6), c2, J and the parameters (3), given
+    the adjoint of A (9)."""
 
     def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
         mu, lam, limit = x[8:]
@@ -120,8 +121,8 @@ def stress_adjoint(
 def flow_adjoint(
     d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: Any
 ) -> tuple[list[Any], list[Any], Any]:
-    """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain, from the
-    adjoint of the new F."""
+    """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain, given
+    the adjoint of the new F."""
 
     def outputs(x: Any, _fixed: Any) -> tuple[list[Any], list[Any]]:
         return von_mises.flow(x[:6], x[6:15], x[15], series), []
@@ -133,8 +134,8 @@ def flow_adjoint(
 def strain_adjoint(
     c: Sequence[Any], f: Sequence[Any], dt: Any, known: Sequence[Any], bars: Sequence[Any], series: Any
 ) -> tuple[list[Any], list[Any]]:
-    """Return the contributions of the strain to the adjoints of C and F (9 each), from those of G (9), J, c2
-    and d (6); ``known`` are G, J, c2, W (6), Z (6), a1, a2 and d, as computed from C and F."""
+    """Return the contributions of the strain to the adjoints of C and F (9 each), given those of G (9), J, c2
+    and d (6); ``known`` holds G, J, c2, W (6), Z (6), a1, a2 and d, computed from C and F."""
 
     def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
         g = algebra.trial_gradient(x[:9], x[9:], fixed[0])
@@ -209,7 +210,7 @@ class Tile:
             self._own = self.code.equal(held, self.number("own").value)
 
     def number(self, name: str) -> Number:
-        """Return a number, the same for all lanes."""
+        """Return a number that is equal in all lanes."""
         return Number(self.code, self.code.splat(self.code.args[name], LANE))
 
     def take(self, name: str) -> list[Number]:
@@ -227,7 +228,7 @@ class Tile:
             self.code.put_lane_vector(place, first + k, value)
 
     def note(self, name: str, *conditions: ir.Value) -> None:
-        """Record 1 if all own lanes meet all conditions, else 0."""
+        """Record 1 if all own lanes meet all conditions, otherwise 0."""
         if self._own is not None:
             conditions = tuple(self.code.implied(self._own, one) for one in conditions)
         self.code.put(name, self.code.all_of(*conditions))
@@ -284,7 +285,7 @@ def update(law: Law, keep: bool, one: Tile | Particle) -> None:
 
 
 def adjoint(law: Law, one: Tile | Particle) -> None:
-    """Adjoints of C, F and the coefficients, from those of A and of the new F."""
+    """Adjoints of C, F and the coefficients, given those of A and the new F."""
     c, f = one.take("c"), one.take("f")
     constants = [one.number(key) for key in CONSTANTS.split()]
     given = c, f, one.take("p"), constants, one.take("a_bar"), one.take("f_new_bar")
@@ -296,7 +297,7 @@ def adjoint(law: Law, one: Tile | Particle) -> None:
 
 
 def strain(one: Tile | Particle) -> tuple[Any, ...]:
-    """Return G, J, the strain, and the conditions for J and |Z|^2 to be in the range of the series."""
+    """Return G, J, the strain, and the conditions under which J and |Z|^2 are in the range of the series."""
     g = algebra.trial_gradient(one.take("c"), one.take("f"), one.number("dt"))
     j = algebra.det(g)
     found, code = von_mises.hencky_strain(g, j, one.series), one.code
@@ -307,7 +308,7 @@ def strain(one: Tile | Particle) -> tuple[Any, ...]:
 
 
 def tile_strain(whole: bool, tile: Tile) -> None:
-    """Strain of a tile; if ``whole``, with the intermediate results for the adjoint."""
+    """Strain of a tile; if ``whole``, also the intermediate results for the adjoint."""
     g, j, (c2, w, z, _z2, a1, a2, d), fits = strain(tile)
     tile.note("served", *fits)
     tile.leave("g", g)
@@ -321,7 +322,7 @@ def tile_strain(whole: bool, tile: Tile) -> None:
 
 
 def tile_stress(tile: Tile) -> None:
-    """A of a tile, from its strain and C; ``rigid`` is 1 where nothing yields."""
+    """A of a tile from its strain and C; ``rigid`` is 1 if no lane yields."""
     d, (j, c2), (mu, lam, limit) = tile.take("d"), tile.take("scalars"), tile.take("p")
     tau = von_mises.stress(d, j, c2, mu, lam, limit, tile.series)
     tile.leave("a", scattered_matrix(tau, tile.take("c"), tile.number("stress_scale"), tile.number("mass")))
@@ -333,7 +334,7 @@ def tile_flow(tile: Tile) -> None:
 
 
 def tile_stress_adjoint(tile: Tile) -> None:
-    """Adjoint of a tile's stress, from that of A; ``rigid`` is 1 where nothing yields."""
+    """Adjoint of a tile's stress, given the adjoint of A; ``rigid`` is 1 if no lane yields."""
     d, (j, c2), a_bar = tile.take("d"), tile.take("scalars"), tile.take("a_bar")
     parameters, scale = tile.take("p"), tile.number("stress_scale")
     d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
@@ -343,7 +344,7 @@ def tile_stress_adjoint(tile: Tile) -> None:
 
 
 def tile_flow_adjoint(tile: Tile) -> None:
-    """Adjoint of a tile's plastic flow, from that of the new F, added to that of the stress."""
+    """Adjoint of a tile's plastic flow, given that of the new F; added to the adjoint of the stress."""
     d, g, f_bar = tile.take("d"), tile.take("g"), tile.take("f_new_bar")
     d_bar, g_bar, limit_bar = flow_adjoint(d, g, tile.take("p")[2], f_bar, tile.series)
     tile.leave("d_bar", [a + b for a, b in zip(tile.take("d_bar"), d_bar, strict=True)])
@@ -352,7 +353,7 @@ def tile_flow_adjoint(tile: Tile) -> None:
 
 
 def tile_strain_adjoint(tile: Tile) -> None:
-    """Adjoints of C and F of a tile from those of d, of the other inputs of the stress, and of G."""
+    """Adjoints of a tile's C and F, given those of d, of the other inputs of the stress, and of G."""
     c, f, g, w, z, d = map(tile.take, ("c", "f", "g", "w", "z", "d"))
     (j, c2), (a1, a2) = tile.take("scalars"), tile.take("coefficients")
     bars = [*tile.take("g_bar"), *tile.take("scalar_bars"), *tile.take("d_bar")]
@@ -378,12 +379,12 @@ SCHEDULE: dict[str, tuple[Callable[..., None], str, str]] = {
     "rest_adjoint": (partial(copy, "f_new_bar", "g_bar"), "bar", ""),
     "strain_adjoint": (tile_strain_adjoint, "source affine bar", "dt mass"),
 }
-"""Parts of the update of a tile: writer, addresses and numbers. Where nothing yields, ``rest`` replaces
+"""Parts of the update of a tile: writer, addresses and numbers. If no lane yields, ``rest`` replaces
 ``flow``."""
 
 
 def particle(one: Particle) -> None:
-    """A in C's place, and F after the substep in F's; unchanged outside the range of the series."""
+    """Write A in place of C and the new F in place of F; unchanged outside the range of the series."""
     code, (mu, lam, limit) = one.code, one.take("p")
     g, j, (c2, _w, _z, _z2, _a1, _a2, d), fits = strain(one)
     served = code.all_of(*fits)
@@ -397,7 +398,7 @@ def particle(one: Particle) -> None:
 
 
 def particle_adjoint(one: Particle) -> None:
-    """Adjoints in place of C, F and the coefficients; unchanged outside the range of the series."""
+    """Write the adjoints in place of C, F and the coefficients; unchanged outside the range of the series."""
     code, a_bar, g_bar, (mu, lam, limit) = one.code, *map(one.take, ("a_bar", "f_new_bar", "p"))
     g, j, (c2, w, z, _z2, a1, a2, d), fits = strain(one)
     served = code.all_of(*fits)
@@ -424,8 +425,8 @@ def particle_adjoint(one: Particle) -> None:
 
 
 def law_makers(law: Law, device: str, mixed: bool) -> dict[str, Maker]:
-    """Return the writers of a law's functions of tiles or particles, by name; with ``mixed``, lanes of a tile
-    may have different laws."""
+    """Return the code generators of a law's functions for tiles or particles, by name; with ``mixed``, lanes
+    of a tile may have different laws."""
     scheduled = law is LAWS["von_mises"]
     if device == "cpu":
         parts = {

@@ -1,4 +1,4 @@
-"""Sums over a particle's 27 nodes, for LLVM.
+"""LLVM code for sums over the 27 grid nodes around a particle.
 
 Taichi's code for these sums reloads the addresses of fields after each store, processes one node at a time
 and never fuses products and sums. Here three neighbouring nodes along z form a row of twelve numbers, in a
@@ -19,7 +19,7 @@ from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, MOMENTUM_FIELD, OFFSETS,
 
 
 def rows_of(code: Code, grid: ir.Value) -> list[list[ir.Value]]:
-    """Return the addresses of the rows of a stencil, by offset along x and y; ``grid`` is its base node."""
+    """Return the addresses of a stencil's rows by offset along x and y; ``grid`` is the base node."""
     along_y = code.mul_word(code.args["axis"], WORD(4))
     along_x = code.mul_word(along_y, code.args["axis"])
     out: list[list[ir.Value]] = []
@@ -34,21 +34,21 @@ class Stencil(Code):
     """A function of a particle and the 27 nodes around it."""
 
     def weights(self, first: int) -> list[list[ir.Value]]:
-        """A particle's weights, or their slopes, by axis and offset."""
+        """A particle's weights, or their derivatives, by axis and offset."""
         return [self.lanes(self.args["stencil"], first + axis, step=3) for axis in range(3)]
 
     def field(
         self, value: Sequence[ir.Value], columns: Sequence[Sequence[ir.Value]], scale: ir.Value
     ) -> list[Row]:
-        """Row of an affine field at the base node and its increments along x and y, from the field's value
-        (4) there and the columns (3) of a matrix times a scale."""
+        """Row of an affine field at the base node, and its increments along x and y, given the field's value
+        (4) at that node and the columns (3) of a matrix times a scale."""
         base = self.vector(value)
         x, y, z = (self.mul(self.vector([*one, self.real(0.0)]), self.splat(scale, 4)) for one in columns)
         second = self.add(base, z)
         return [self.row(base, second, self.add(second, z)), self.row(x, x, x), self.row(y, y, y)]
 
     def over(self, field: Sequence[Row]) -> Iterator[list[Row]]:
-        """A field's rows by offset along x, and y."""
+        """Iterate over a field's rows by offset along x and y."""
         x = field[0]
         for i in range(3):
             along = [x]
@@ -59,12 +59,13 @@ class Stencil(Code):
                 x = self.both(self.add, x, field[1])
 
     def reduced(self, row: Row, weights: Sequence[ir.Value]) -> ir.Value:
-        """Weighted sum of a row's 4-vectors; with fewer weights, of the last ones."""
+        """Weighted sum of a row's 4-vectors; with fewer weights than vectors, of the last ones."""
         parts = self.parts(row)[3 - len(weights) :]
         return self.dot(parts, [self.splat(weight, 4) for weight in weights])
 
     def moments(self, sums: Sums, z: Sequence[ir.Value]) -> list[ir.Value]:
-        """Sums of w g, and of w g times a node's offset along x, y and z, 4-vectors, by weights along z."""
+        """Sums of w g, and of w g times the node offsets along x, y and z, as 4-vectors, by weights along
+        z."""
         of_x, of_y = self.reduced(sums.x, z), self.reduced(sums.y, z)
         return [
             self.reduced(sums.plain, z),
@@ -75,10 +76,10 @@ class Stencil(Code):
 
 
 class Sums:
-    """Sums over the rows of a stencil: of a grid, and times the rows' offsets along x and y."""
+    """Sums over the rows of a stencil of a grid, unweighted and times the row offsets along x and y."""
 
     def __init__(self, code: Code, weights: Sequence[Sequence[ir.Value]]) -> None:
-        """Begin, with weights by axis and offset."""
+        """Initialise with weights by axis and offset."""
         self._code, (self._wx, self._wy, _) = code, weights
         self._twice = [code.add(w[2], w[2]) for w in weights[:2]]
         self.plain: Any = None
@@ -98,8 +99,9 @@ class Sums:
 
 
 def scatter(module: ir.Module, name: str, real: ir.Type) -> None:
-    """Add an affine field, weighted, to a particle's nodes: its value at the base node is in lane vectors
-    from ``value`` with ``last`` as fourth entry, its increments are ``scale`` times a matrix's columns."""
+    """Add an affine field, weighted, to a particle's nodes. Its value at the base node is in the lane vectors
+    from ``value`` with ``last`` as fourth entry; its increments are ``scale`` times the columns of a
+    matrix."""
     code = Stencil(module, name, real, "grid stencil value matrix", "last scale")
     args, w = code.args, code.weights(WEIGHTS)
     value = [*code.lanes(args["value"], 0), args["last"]]
@@ -114,7 +116,7 @@ def scatter(module: ir.Module, name: str, real: ir.Type) -> None:
 
 def gather(module: ir.Module, name: str, real: ir.Type) -> None:
     """Write a particle's v, C and x after a substep to the state at ``target``, from the grid's velocities
-    and x at ``source``; its squared speed is returned."""
+    and x at ``source``; return its squared speed."""
     code = Stencil(module, name, real, "grid stencil source target", "dt end scale speed")
     args, w = code.args, code.weights(WEIGHTS)
     sums = Sums(code, w)
@@ -135,8 +137,8 @@ def gather(module: ir.Module, name: str, real: ir.Type) -> None:
 
 
 def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
-    """Adjoint of both transfers of a particle: of x and v before the substep, in place of those after it at
-    ``bar``, and of A, in A's place at ``matrix``; x is at ``source``, v at ``after``."""
+    """Adjoint of both transfers of a particle. The adjoints of x and v before the substep replace those after
+    it at ``bar``, and the adjoint of A replaces A at ``matrix``; x is at ``source``, v at ``after``."""
     code = Stencil(
         module, name, real, "velocity momentum stencil matrix source after bar", "dt end dx inverse mass"
     )
@@ -185,10 +187,10 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
 
 
 def gather_sums(module: ir.Module, name: str, real: ir.Type) -> None:
-    """Sums over the grid for a particle's adjoint: over its nodes of w p, and of w p times the node's
-    offset (0, 1, 2) along x, y and z, 3-vectors in ``m``, where p is the momentum's adjoint; and in ``t`` the
-    sum of grad_f w (p . q + velocity . h), where ``q`` and ``h`` are affine fields of 4-vectors: value at the
-    base node and increments along x, y, z. ``w`` are weights by node and axis, ``s`` their slopes."""
+    """Sums over a particle's nodes for its adjoint. ``m`` receives w p, and w p times the node offset (0, 1,
+    2) along x, y and z, 3-vectors, where p is the adjoint of the momentum; ``t`` receives the sum of
+    grad_f w (p . q + velocity . h) for affine fields ``q`` and ``h`` of 4-vectors (value at the base node,
+    then increments along x, y, z). ``w`` holds weights by node and axis, ``s`` their derivatives."""
     one = Particle("w9 s9 q16 h16 m12 t3", "", module, name, real, "velocity momentum")
     code, w, s = one.code, one.take("w"), one.take("s")
     q, h = (_rows(one.take(key)) for key in ("q", "h"))
