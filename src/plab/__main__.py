@@ -1,4 +1,4 @@
-"""``python -m plab``: the command ``plab``; see :mod:`plab.cli.main`."""
+"""``python -m plab``: alias of ``plab``; see :mod:`plab.cli.main`."""
 
 import sys
 

@@ -28,16 +28,16 @@ class PlabError(Exception):
 
 
 class ArgumentError(PlabError, ValueError):
-    """An invalid argument, from Python or on a command line."""
+    """Invalid argument, from Python or the command line."""
 
 
 class ConfigError(PlabError, ValueError):
-    """An invalid configuration; the message is one line with the problem and the remedy."""
+    """Invalid configuration; the message is one line with the problem and the remedy."""
 
 
 @contextmanager
 def located(place: str, kind: type[PlabError] = ConfigError) -> Iterator[None]:
-    """Convert errors inside the ``with`` block to ``kind``, with a message that begins with a place."""
+    """Convert errors inside the ``with`` block to ``kind``, prefixing the message with a location."""
     try:
         yield
     except PlabError as error:
@@ -58,7 +58,7 @@ def tell(message: str) -> None:
 
 
 def out_of_memory(error: MemoryError) -> str:
-    """Return a one-line message about insufficient memory; Python's own error is empty."""
+    """Return a one-line message about insufficient memory, because Python's own message is empty."""
     return str(error) or "out of memory: close other programs, or use fewer particles or environments"
 
 

@@ -1,4 +1,4 @@
-"""Untrusted files: archives, NumPy arrays and shapes; and plab's cache folder.
+"""Reading of untrusted files (archives, NumPy arrays and shapes), and plab's cache folder.
 
 Files are read as data: nothing is unpickled, extracted or executed, and unpacked sizes are limited.
 """
@@ -28,7 +28,7 @@ LARGEST = 1 << 31
 """Largest size of an array, a table or an archive member in memory [bytes]."""
 
 _RATIO, _SMALL = 200, 1 << 24
-"""Largest ratio of unpacked to packed size, for results above a size [B]. Deflate reaches 1,032."""
+"""Largest ratio of unpacked to packed size, for files above a size [B]. Deflate reaches 1,032."""
 
 _UNPACKING_MEMORY = 1 << 28
 """Maximum working memory of xz [B]; plab's own archives need a quarter."""
@@ -41,7 +41,7 @@ _LARGEST_SHAPE = 1 << 28
 
 
 UNFINISHED = ".unfinished-"
-"""Start of the names of files and folders that are being written."""
+"""Prefix of files and folders while they are being written."""
 
 
 class UnreadableError(ValueError):
@@ -49,7 +49,7 @@ class UnreadableError(ValueError):
 
 
 class ShapeError(PlabError, ValueError):
-    """A mesh, point cloud or mass tensor is invalid; the message names the file and the reason."""
+    """Invalid mesh, point cloud or mass tensor; the message names the file and the reason."""
 
 
 def cache_dir() -> Path:
@@ -98,7 +98,7 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file for :func:`member_bytes`; if ``packed``, it is compressed as a whole, by xz.
+    """Open a zip file for :func:`member_bytes`; with ``packed``, the zip file itself is compressed by xz.
 
     The last unpacked archive is kept in memory. Names of members never become paths.
 
@@ -136,7 +136,7 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     Raises:
         UnreadableError: If it exceeds a size limit.
         ValueError: If it is damaged or encrypted.
-        KeyError: If there is none of this name.
+        KeyError: If the archive has no such member.
     """
     info = archive.getinfo(name)
     # Other compression methods unpack a whole member before its size is known.
@@ -181,7 +181,8 @@ def read_array(path: Path) -> np.ndarray:
     """Return the array of a ``.npy`` file.
 
     Raises:
-        UnreadableError: If it is not such a file, truncated, or contains other data than numbers and text.
+        UnreadableError: If it is not a ``.npy`` file, truncated, or contains data other than numbers and
+            text.
         OSError: If it cannot be opened.
     """
     regular_file(path)
@@ -190,11 +191,11 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file by their names.
+    """Return the arrays of an ``.npz`` file by name.
 
     Raises:
-        UnreadableError: If it contains other data than numbers and text.
-        ValueError: If it is not such a file, or damaged.
+        UnreadableError: If it contains data other than numbers and text.
+        ValueError: If it is not an ``.npz`` file, or damaged.
         OSError: If it cannot be opened.
     """
     arrays = {}
@@ -207,7 +208,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def array_in(file: BinaryIO) -> np.ndarray:
-    """Return the array of an open ``.npy`` file, as :func:`read_array` does."""
+    """Return the array of an open ``.npy`` file; see :func:`read_array`."""
     try:
         with _damage():
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)

@@ -28,7 +28,7 @@ TRANSPORT_EPSILONS = (2.0 ** -np.repeat(np.arange(10), 2)).tolist()
 """Entropic regularisation in each iteration of :func:`earth_movers_distances` [domain units]."""
 
 TINY = 1e-12
-"""Fraction of the mass below which a difference counts as none."""
+"""Fraction of the mass below which a difference is ignored."""
 
 TARGET_MASS = 1e-4
 """Mass above which a grid node belongs to the target."""
@@ -58,14 +58,14 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
     """Spread particles of equal mass over the grid with the quadratic B-spline.
 
     Node i is at i / n. A particle within half a cell of a lower face also contributes to the ghost node at
-    -1; this mass is added to node 0, so that none is lost.
+    -1; this mass is added to node 0, so that the total is preserved.
 
     Args:
         x: Particle positions [domain units], shape [particle, 3].
         n: Grid nodes per axis.
         mass: Mass per particle.
-        floor_stencil: Convention for these particles, as in :class:`plab.scenes.Scene`. With ``release``,
-            they have negative weights instead of a ghost node.
+        floor_stencil: Convention for particles near a lower face, as in :class:`plab.scenes.Scene`; with
+            ``release`` they have negative weights instead of a ghost node.
 
     Returns:
         Mass tensor, shape [n, n, n], float64.
@@ -112,17 +112,18 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
 
 
 def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
-    """Return the soft intersection over union of two mass tensors of one shape, each divided by its maximum.
+    """Return the soft intersection over union of two mass tensors of equal shape, each divided by its
+    maximum.
 
-    It is ``sum(a b) / sum(a + b - a b)``, in [0, 1]; symmetric, and not 1 for a tensor and itself unless it
-    is binary.
+    The value is ``sum(a b) / sum(a + b - a b)``, in [0, 1]; it is symmetric, and the soft IoU of a tensor
+    with itself is 1 only if the tensor is binary.
 
     Raises:
         ValueError: If the shapes differ or a tensor has no mass.
     """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if a.shape != b.shape:
-        raise ArgumentError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
+        raise ArgumentError(f"mass tensors have different shapes {list(a.shape)} and {list(b.shape)}")
     largest_a, largest_b = a.max(initial=0.0), b.max(initial=0.0)
     # NaN must fail this comparison, too.
     if not (0.0 < largest_a < np.inf and 0.0 < largest_b < np.inf):
@@ -147,8 +148,8 @@ def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PORTIONS) -> float:
-    """Return the earth mover's distance of two mass tensors, shape [n, n, n]: the least mean distance
-    [domain units] to transport one into the other.
+    """Return the earth mover's distance of two mass tensors, shape [n, n, n]: the minimum mean transport
+    distance [domain units].
 
     Both tensors are divided into ``points`` portions of equal mass, of neighbouring nodes along a
     space-filling curve, which are matched optimally. For shapes far apart the result is exact up to the size
@@ -189,13 +190,13 @@ def earth_movers_distances(
         for masses in (a, b)
     )
     out = like.new_empty(len(x))
-    # In parts, so that the costs fit the memory.
+    # In parts, so that the cost matrices fit into memory.
     for first in range(0, len(x), 4):
         part = slice(first, first + 4)
         cost = (x[part, :, None] - y[part, None]).norm(dim=-1)
         f = g = like.new_zeros(cost.shape[:2])
         for epsilon in TRANSPORT_EPSILONS:
-            # Over-relaxation by 1.5 halves the error of as many iterations.
+            # Over-relaxation by 1.5 halves the error for the same number of iterations.
             f = f - 1.5 * (f + epsilon * (((g[:, None] - cost) / epsilon).logsumexp(2) - log_count))
             g = g - 1.5 * (g + epsilon * (((f[:, :, None] - cost) / epsilon).logsumexp(1) - log_count))
         f = (cost - g[:, None]).amin(2)
@@ -219,25 +220,25 @@ def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
 
 
 def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
-    """Score an episode by the mass tensors of its first and last state and of the target, shape [n, n, n]
+    """Score an episode by the mass tensors of its first and last states and of the target, shape [n, n, n]
     each."""
     return scores_from_iou(soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target))
 
 
 def scores_from_iou(start: float, end: float, best: float) -> Scores:
-    """Score an episode by the soft IoUs of its initial and final mass tensor and of the target itself
-    (``best``) with the target.
+    """Score an episode by the soft IoUs of its initial and final mass tensors, and of the target itself
+    (``best``), with the target.
 
-    If the initial shape has the IoU of the target itself, so that the formulas divide by zero, the score is 1
-    if the final shape has it, too, and 0 otherwise.
+    If the initial IoU equals that of the target itself, the formulas divide by zero; the score is then 1 if
+    the final IoU is equal, too, and 0 otherwise.
     """
     (score,), (printed,) = batch_scores(score_scale([start], [best]), np.array([end]))
     return Scores(start, end, best, score_printed=float(printed), score=float(score))
 
 
 def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
-    """Return the constants of :func:`batch_scores`, shape [4, 2, batch], for soft IoUs of the initial mass
-    tensors and of the targets themselves, shape [batch] both."""
+    """Return the constants of :func:`batch_scores`, shape [4, 2, batch], given the soft IoUs of the initial
+    mass tensors and of the targets themselves, shape [batch] each."""
     start = np.broadcast_to(np.asarray(start, np.float64), (2, np.size(start)))
     best = np.stack([np.asarray(best, np.float64), np.ones_like(start[0])])
     nothing_to_gain = best - start <= 1e-12
@@ -247,7 +248,8 @@ def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
 
 
 def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
-    """Return ``score`` and ``score_printed``, shape [batch], as :func:`scores_from_iou`; arrays or tensors.
+    """Return ``score`` and ``score_printed``, shape [batch], of many episodes, as arrays or tensors; see
+    :func:`scores_from_iou`.
 
     Args:
         scale: Constants from :func:`score_scale`.
@@ -259,8 +261,8 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
 
 
 def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return missing (positive) and excess (negative) mass by node, as fractions of all mass, shape [n, n,
-    n]. Both mass tensors are normalised and smoothed, because particles are sampled at random."""
+    """Return missing (positive) and excess (negative) mass per node as fractions of the total mass, shape [n,
+    n, n]. Both mass tensors are normalised and smoothed, because particles are sampled at random."""
     # Imported here, because SciPy would slow down every `--help`.
     from scipy.ndimage import gaussian_filter
 
@@ -269,12 +271,12 @@ def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Describe a target by excess and missing mass, for mass tensors of the initial state and of the target,
-    shape [n, n, n].
+    """Describe a target by excess and missing mass, given the mass tensors of the initial state and the
+    target, shape [n, n, n].
 
     Returns:
-        Excess mass, then missing mass: fraction of all mass, centroid (3) and standard deviation along each
-        axis (3) [domain units] of each; shape [14], float64.
+        Fraction of the total mass, centroid (3) and standard deviation along each axis (3) [domain units], of
+        the excess mass, then of the missing mass; shape [14], float64.
     """
     change = mass_change(start, target)
     node = np.indices(change.shape).reshape(3, -1) / len(change)
@@ -289,15 +291,15 @@ def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def total_loss(terms: Any, weights: Any) -> Any:
-    """Return the weighted sum, shape [...], of the loss terms of a step, shape [..., term], with ``weights``,
+    """Return the weighted sum, shape [...], of a step's loss terms, shape [..., term], with ``weights``,
     shape [term]; arrays or tensors."""
     # Not a matrix product, whose rounding depends on the number of losses.
     return (terms * weights).sum(-1)
 
 
 def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
-    """Return the reward of each step, shape [..., T]: the loss of the initial state, with terms of shape
-    [..., term], minus that after the step, with terms of shape [..., T, term]; arrays or tensors."""
+    """Return the reward of each step, shape [..., T]: the loss of the initial state minus the loss after the
+    step, given terms of shape [..., term] and [..., T, term]; arrays or tensors."""
     return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
 
 
@@ -314,14 +316,14 @@ TERMS = {
 """Terms by name, as ``module:Class``."""
 
 _DEFAULT_TERMS = {"contact": "nearest"}
-"""Default implementations of weights with other names than :data:`TERMS`."""
+"""Default implementations of weights whose names are not in :data:`TERMS`."""
 
 
 def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the class, ``module:Class``, of each weight's term; nothing is imported.
+    """Return the class, ``module:Class``, of each weight's term, without importing it.
 
     Raises:
-        ConfigError: If a name is not a term, or a choice has no weight.
+        ConfigError: If a name is not a term, or an implementation has no weight.
     """
     chosen = _DEFAULT_TERMS | dict(choices or {})
     for name in choices or {}:

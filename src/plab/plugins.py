@@ -1,4 +1,4 @@
-"""Objects named as ``module:NAME`` in a configuration, in plab or in external files.
+"""Loading of objects named as ``module:NAME`` in a configuration, from plab or from external files.
 
 Modules are searched for in Python's path, then in the config folder (``--config-dir``) and its parent folder.
 Results record only the text, which does not depend on the computer.
@@ -40,7 +40,7 @@ else:
 
 
 class Registry(UserDict[str, Any]):
-    """Objects by name, given as ``module:NAME`` and imported on first access."""
+    """Named objects, given as ``module:NAME`` and imported on first access."""
 
     def __init__(self, kind: type, places: Mapping[str, str]) -> None:
         """Store the ``module:NAME`` of instances of ``kind`` (``type`` for classes) by name."""
@@ -53,8 +53,8 @@ class Registry(UserDict[str, Any]):
         return self.data[name]
 
     def find(self, name: str, key: str) -> Any:
-        """Return the object of a name or, outside the registry, of ``module:NAME``; raise ConfigError, which
-        names the configuration's key, if there is none."""
+        """Return the object with a name in the registry, or any ``module:NAME``; raise ConfigError, which
+        names the configuration key, if it does not exist."""
         if ":" in name:
             return load_object(name, self._kind)
         if name not in self:
@@ -63,7 +63,7 @@ class Registry(UserDict[str, Any]):
 
 
 def search_in(config_dir: str | Path) -> None:
-    """Add a config folder and its parent folder to the module path for the rest of the process."""
+    """Append a config folder and its parent folder to the module path for the rest of the process."""
     folder = Path(config_dir).resolve()
     # At the end, so that user files do not hide modules of Python or plab.
     sys.path += [path for path in (str(folder), str(folder.parent)) if path not in sys.path]
@@ -86,7 +86,7 @@ def exported_module_path() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return the object named by ``module:NAME``, an instance of ``kind`` (``type`` for classes); raise
+    """Return the object that ``module:NAME`` refers to, an instance of ``kind`` (``type`` for classes); raise
     ConfigError if it cannot be imported or is of another kind."""
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):

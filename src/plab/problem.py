@@ -92,7 +92,7 @@ class BatchMeasures:
 
 
 def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
-    """Build the scene of each configuration, with one object for equal scenes; errors are those of
+    """Build the scene of each configuration, sharing one object between equal scenes; errors are those of
     :func:`plab.config.build_scene`."""
     kinds = kinds_of(cfgs)
     scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
@@ -100,7 +100,8 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Return True if a scene and its target fit into the grid's domain, which is smaller for coarse grids."""
+    """Return True if a scene and its target fit into the domain of the grid, which is smaller for coarse
+    grids."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):
@@ -109,8 +110,8 @@ def fits(cfg: Config) -> bool:
 
 
 def drawn_scenes(cfg: Config, numbers: Iterable[int]) -> list[Config]:
-    """Return configurations of a task's random scenes, those that fit the grid; all if none does, as building
-    them raises their errors."""
+    """Return the configurations of a task's random scenes that fit the grid, or all if none fits, because
+    building them then raises their errors."""
     drawn = drawn_configs(cfg, [FIRST_SCENE + number for number in numbers])
     return [one for one in drawn if fits(one)] or drawn
 
@@ -118,11 +119,11 @@ def drawn_scenes(cfg: Config, numbers: Iterable[int]) -> list[Config]:
 def make_simulator(
     cfgs: Config | Sequence[Config], scenes: Sequence[Scene] | None = None, **options: Any
 ) -> Simulator:
-    """Create a simulator with the scenes, loss terms, device, precision and memory budget of configurations.
+    """Create a simulator from the scenes, loss terms, device, precision and memory budget of configurations.
 
     Args:
         cfgs: A configuration, or one per environment, with equal ``sim`` and loss.
-        scenes: Their scenes, if already built.
+        scenes: Scenes of the configurations, if already built.
         **options: Arguments of :class:`plab.sim.Simulator`, whose errors apply, that override the
             configuration's.
     """
@@ -135,7 +136,7 @@ def make_simulator(
 
 
 def kinds_of(cfgs: Sequence[Config]) -> list[str]:
-    """Return texts that are equal for configurations of the same environment, which differ only in seed,
+    """Return strings that are equal for configurations of the same environment, which differ only in seed,
     files and learning."""
 
     texts: dict[int, str] = {}
@@ -162,11 +163,11 @@ class Problem:
     """
 
     def __init__(self, cfgs: Sequence[Config], simulator: Simulator | None = None) -> None:
-        """Build everything.
+        """Build scenes, targets and simulator.
 
         Args:
             cfgs: One configuration per environment, with equal ``protocol``, ``sim``, ``targets`` and loss.
-            simulator: Existing simulator of the same scenes and loss terms, if any.
+            simulator: Existing simulator with the same scenes and loss terms, if any.
 
         Raises:
             plab.config.ConfigError: If the configurations are incompatible.
@@ -195,10 +196,11 @@ class Problem:
         self.refresh(kinds)
 
     def refresh(self, kinds: Sequence[str] | None = None) -> None:
-        """Reset the simulator, and update after changes of its scenes, targets and initial states.
+        """Reset the simulator, and update derived data after changes of its scenes, targets or initial
+        states.
 
         Args:
-            kinds: Texts that are equal for equal environments; default: all may differ.
+            kinds: Strings that are equal for equal environments; default: all may differ.
         """
         self.simulator.reset()
         self.scenes, self._initial_mass = self.simulator.scenes, self.simulator.mass_tensor()
@@ -218,12 +220,12 @@ class Problem:
         particles: Mapping[int, np.ndarray],
         targets: Mapping[int, tuple[np.ndarray, np.ndarray]],
     ) -> None:
-        """Set the initial states of the next episodes; call :meth:`note_starts` when they have started.
+        """Set the initial states of the next episodes; call :meth:`note_starts` once they have started.
 
         Args:
             scenes: One scene per environment, of the same kind as before.
-            particles: Initial positions by environment, for those that change, [particle, 3] each.
-            targets: Mass tensors and distances by environment, for those that change, shape [n, n, n] each.
+            particles: Changed initial positions by environment, [particle, 3] each.
+            targets: Changed mass tensors and distances by environment, shape [n, n, n] each.
 
         Raises:
             plab.scenes.SceneError: If a scene cannot be simulated; nothing is changed then.
@@ -272,18 +274,18 @@ class Problem:
         self._scale = Constants(score_scale(*zip(*pairs, strict=True)))
 
     def loss_of(self, terms: Any) -> Any:
-        """Return the weighted sum of terms, shape [..., term], as an array or a tensor of shape [...]."""
+        """Return the weighted sum of terms, shape [..., term], as an array or tensor of shape [...]."""
         return total_loss(terms, self._held_weights.like(terms))
 
     def scores_of(self, iou: Any) -> tuple[Any, Any]:
-        """Return ``score`` and ``score_printed`` of states by their soft IoUs, shape [batch] all; arrays or
-        tensors."""
+        """Return ``score`` and ``score_printed`` of states, given their soft IoUs; arrays or tensors of shape
+        [batch]."""
         return batch_scores(self._scale.like(iou), iou)
 
     def totals(self, terms: Any, loss: Any, first_loss: Any, iou: Any) -> dict[str, float]:
-        """Return the measures of a batch's first episode, as in the columns of results: of its terms after
-        each step, shape [T, term], its step losses, shape [T], the loss of its initial state, and the soft
-        IoUs of the last states, shape [batch]; arrays or tensors."""
+        """Return the measures of a batch's first episode, as in the columns of results, given its terms after
+        each step, shape [T, term], its step losses, shape [T], its initial loss, and the soft IoUs of the
+        last states, shape [batch]; arrays or tensors."""
         sums = zip(self.term_names, terms.sum(0).tolist(), strict=True)
         return {
             "loss": float(loss.sum()),
@@ -294,7 +296,7 @@ class Problem:
         }
 
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
-        """Return the measures of episodes, simulated as in :meth:`rollout`, without an error for divergence.
+        """Return the measures of episodes simulated as in :meth:`rollout`, without an error for divergence.
         CUDA tensors stay on the device, except failures."""
         result = self.simulator.rollout(actions, gradient=gradient, strict=False)
         terms, iou = result.step_terms, result.step_iou[:, -1]
@@ -316,8 +318,9 @@ class Problem:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
             gradient: Whether to compute the gradient of the trajectory loss.
             strict: Whether divergence of an environment is an error instead of an entry in ``failures``.
-            exact: Whether to fetch the mass tensors of the last states and compute scores from them, in
-                float64. Otherwise scores use the simulator's IoU, which agrees to rounding and has no cost.
+            exact: Whether to copy the mass tensors of the last states to the host and compute scores from
+                them, in float64. Otherwise scores use the simulator's IoU, which agrees to rounding and has
+                no cost.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -351,7 +354,7 @@ class Problem:
 
 
 def _warn_of_thin(scenes: Sequence[Scene]) -> None:
-    """Log a warning for manipulators that fit between grid nodes, where contact acts."""
+    """Log a warning for manipulators so thin that they fit between grid nodes, where contact is computed."""
     thin = {
         f"manipulators[{number}] is {2 * min(tool.size):.2g} thin, less than half a cell of the grid, "
         f"{scene.dx / 2:.2g}: it passes through bodies; use a finer grid"
@@ -372,13 +375,13 @@ def target_distance(mass: np.ndarray) -> np.ndarray:
 
 
 def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool = False) -> np.ndarray:
-    """Return the mass tensors of targets, shape [batch, n, n, n], from the release's files or built as
-    :func:`plab.targets.build_targets` does.
+    """Return the mass tensors of targets, shape [batch, n, n, n], from the release's files or from
+    :func:`plab.targets.build_targets`.
 
     Args:
-        cfgs: One configuration per environment, with one object for equal ones.
+        cfgs: One configuration per environment; equal ones share one object.
         simulator: Simulator of their scenes.
-        rebuild: Simulate also cached targets.
+        rebuild: Whether to simulate cached targets again.
     """
     source = cfgs[0].targets.source
     if source is None:
@@ -388,9 +391,9 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 
 
 def require_alike(cfgs: Sequence[Config]) -> None:
-    """Raise ConfigError unless configurations can share a simulator and a space of observations."""
+    """Raise ConfigError unless configurations can share a simulator and an observation space."""
     if isinstance(cfgs, Config) or not cfgs:
-        raise ConfigError("give a list of configurations, one per environment: [cfg]")
+        raise ConfigError("pass a list of configurations, one per environment: [cfg]")
     keys = ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets", *OBSERVATION_KEYS)
     parts = [dict(leaves({key: _plain(attrgetter(key)(cfg)) for key in keys})) for cfg in cfgs]
     for number, this in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar with the remaining time on a terminal, otherwise lines at intervals."""
+"""Progress of a run: a bar with the remaining time on a terminal, lines at intervals elsewhere."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def show_progress(
 
     Args:
         title: Title of the bar.
-        start: Steps done before.
+        start: Steps already done.
         total: Total number of steps, including earlier ones; None: show only the title, on a terminal.
         enabled: Whether to show anything.
         plain_every: Steps between lines without a terminal.
@@ -68,8 +68,8 @@ def show_progress(
 
 
 def show_line(text: str) -> None:
-    """Show the current measurement on a terminal, in a line of standard error that is overwritten by the
-    next."""
+    """Show the current measurement on a terminal, in a line of standard error that the next one
+    overwrites."""
     if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

@@ -1,4 +1,4 @@
-"""``python -m plab.run``: the same as ``plab run``."""
+"""``python -m plab.run``: alias of ``plab run``."""
 
 import sys
 

@@ -1,7 +1,7 @@
 """Reference demonstrations: the best known actions for every configuration of the suite.
 
-For scripted targets they are the actions of the script, for geometric targets the best of all runs. One file
-per task, ``<Task>.csv``, has a row per variant and environment step; ``scores.csv`` has their scores.
+For scripted targets these are the actions of the script, for geometric targets the best actions of all runs.
+``<Task>.csv`` has a row per variant and environment step of a task; ``scores.csv`` has the scores.
 ``benchmarks/record_demonstrations.py`` writes both; ``plab demonstrations`` replays them.
 """
 
@@ -22,7 +22,7 @@ SCORES = "scores.csv"
 
 
 def load_actions(task: str, variant: str) -> np.ndarray | None:
-    """Return the recorded actions of a configuration of the suite, in [-1, 1], shape [T, A], if any."""
+    """Return the recorded actions of a configuration of the suite, in [-1, 1], shape [T, A], or None."""
     path = FOLDER / f"{task}.csv"
     if not path.is_file():
         return None
@@ -33,6 +33,6 @@ def load_actions(task: str, variant: str) -> np.ndarray | None:
 
 def known_actions(cfg: Config) -> np.ndarray | None:
     """Return the best known actions for a configuration, in [-1, 1], shape [T, A]: the script of its target,
-    or recorded actions; None for a geometric target without a record."""
+    or recorded actions; None for a geometric target without recorded actions."""
     scripted = demonstration(build_scene(cfg), cfg.task.target)
     return load_actions(cfg.task.name, cfg.variant) if scripted is None else scripted

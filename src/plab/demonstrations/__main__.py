@@ -1,4 +1,4 @@
-"""``python -m plab.demonstrations``: the same as ``plab demonstrations``."""
+"""``python -m plab.demonstrations``: alias of ``plab demonstrations``."""
 
 from plab.cli.suite import demonstrations
 

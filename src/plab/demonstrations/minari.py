@@ -1,8 +1,8 @@
-"""Datasets in the format of Minari (Farama Foundation): HDF5, and metadata in JSON.
+"""Datasets in Minari's format (Farama Foundation): HDF5, and metadata in JSON.
 
-A dataset is a folder ``<namespace>/<name>-v<k>/data`` of two files: ``main_data.hdf5`` has a group of each
-episode, with observations and infos of T + 1 states and actions, rewards, terminations and truncations of T
-steps; ``metadata.json`` has the spaces. The package minari can read both, but is not required.
+A dataset is a folder ``<namespace>/<name>-v<k>/data`` with two files. ``main_data.hdf5`` has one group per
+episode, with observations and infos of T + 1 states, and actions, rewards, terminations and truncations of T
+steps; ``metadata.json`` has the spaces. The package minari can read them, but is not required.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VERSION = "0.5.4"
 
 
 class DatasetError(PlabError, ValueError):
-    """A dataset cannot be read or written; the message names it and the reason."""
+    """Unreadable or unwritable dataset; the message names it and the reason."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Episode:
         actions: Actions, shape [T, A].
         rewards: Rewards, shape [T].
         infos: Measures of the states, by name, shape [T + 1] each.
-        attributes: Attributes of the episode: numbers and texts by name.
+        attributes: Attributes of the episode: numbers and strings by name.
     """
 
     observations: Any
@@ -59,15 +59,15 @@ def write_dataset(
     env_spec: EnvSpec,
     about: Mapping[str, Any],
 ) -> list[Mapping[str, Any]]:
-    """Write a dataset atomically, and return the attributes of the episodes.
+    """Write a dataset atomically; return the attributes of the episodes.
 
     Args:
-        folder: Folder of datasets, such as ``MINARI_DATASETS_PATH`` names.
-        name: Name of the dataset in it, such as ``plab/Move-v0``.
+        folder: Folder of datasets, such as ``MINARI_DATASETS_PATH``.
+        name: Name of the dataset, such as ``plab/Move-v0``.
         episodes: Episodes, held in memory one at a time.
         spaces: Spaces of observations and actions.
-        env_spec: Environment of minari's ``recover_environment``.
-        about: Further metadata.
+        env_spec: Environment specification for minari's ``recover_environment``.
+        about: Additional metadata.
 
     Raises:
         DatasetError: If the dataset exists, or there are no episodes.
@@ -117,7 +117,7 @@ def _write(group: h5py.Group, arrays: Mapping[str, Any]) -> None:
 
 
 def _described(space: Space[Any]) -> dict[str, Any]:
-    """Return the description of a space in Minari's metadata."""
+    """Return the description of a space for Minari's metadata."""
     if isinstance(space, Dict):
         return {"type": "Dict", "subspaces": {key: _described(own) for key, own in space.items()}}
     assert isinstance(space, Box)
@@ -129,8 +129,8 @@ def _described(space: Space[Any]) -> dict[str, Any]:
 
 
 def metadata_of(path: str | Path) -> dict[str, Any]:
-    """Return the metadata of a dataset, and the folder of its files as ``path``. The dataset is given by its
-    folder, by the subfolder ``data``, or as ``example``. Raise DatasetError if there is none."""
+    """Return the metadata of a dataset, with the folder of its files as ``path``. The dataset is given by its
+    folder, the subfolder ``data``, or as ``example``. Raise DatasetError if it does not exist."""
     path = EXAMPLE if str(path) == "example" else Path(path).expanduser()
     for place in (path / "data", path):
         if (file := place / "metadata.json").is_file():
@@ -142,8 +142,7 @@ def metadata_of(path: str | Path) -> dict[str, Any]:
 
 
 def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episode]:
-    """Yield the episodes of a dataset, in order, at most ``limit``; raise DatasetError if it cannot be
-    read."""
+    """Yield at most ``limit`` episodes of a dataset, in order; raise DatasetError if it cannot be read."""
     metadata = metadata_of(path)
     file = metadata["path"] / "main_data.hdf5"
     try:

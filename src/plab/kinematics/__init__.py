@@ -1,5 +1,4 @@
-"""Articulated models: forward kinematics from joint-space actions to twists of rigid links, and its
-adjoint."""
+"""Articulated models: forward kinematics from joint-space actions to link twists, and its adjoint."""
 
 from plab.kinematics.chain import Chain, Joint, Link, ModelError
 from plab.kinematics.models import locate_model, read_model

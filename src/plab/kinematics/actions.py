@@ -1,4 +1,4 @@
-"""Conversion of joint-space actions to twists of the links of a chain, and its adjoint, in PyTorch.
+"""Conversion of joint-space actions to twists of the links of a chain, and the adjoint, in PyTorch.
 
 In an environment step every joint moves by its share of the action, within its limits. Forward kinematics
 gives the frames of the links before and after; a link's twist is its displacement and the logarithm of its
@@ -32,14 +32,14 @@ class LinkMotion:
     """
 
     def __init__(self, given: list[Tensor], made: list[Tensor], as_array: bool) -> None:
-        """Store the inputs ``given``, actions and joint positions, and the outputs ``made``, twists and joint
-        positions."""
+        """Store the inputs ``given`` (actions and joint positions) and the outputs ``made`` (twists and joint
+        positions)."""
         self._given, self._made, self._as_array = given, made, as_array
         self.twists, self.joints = map(self._out, made)
 
     def pull_back(self, bar: Any, joints_bar: Any = None) -> tuple[Any, Any]:
         """Return the derivatives with respect to the actions, shape [T, batch, A], and the initial joint
-        positions, from those with respect to the twists and the final joint positions."""
+        positions, given those with respect to the twists and the final joint positions."""
         bars = [torch.as_tensor(bar).to(self._made[0])]
         made = self._made[:1]
         if joints_bar is not None:
@@ -52,7 +52,7 @@ class LinkMotion:
 
 
 class JointActions:
-    """Map from actions to twists, for a batch of scenes with chains of one topology.
+    """Map from actions to twists, for a batch of scenes whose chains share one topology.
 
     Attributes:
         start: Joint positions at t = 0, shape [batch, joint].
@@ -63,7 +63,7 @@ class JointActions:
         chains: list[Chain] = [scene.kinematics for scene in scenes]  # type: ignore[misc]
         first = chains[0]
         self._direct = scenes[0].action_dim - len(first.components)
-        # Joints by their depth in the tree: all of one depth are computed together.
+        # Joints by depth in the tree; each depth is computed at once.
         depth: list[int] = []
         for joint in first.joints:
             depth.append(depth[joint.parent] + 1 if joint.parent >= 0 else 0)
@@ -74,7 +74,7 @@ class JointActions:
         self._indices = {
             "component": [joint.component for joint in first.joints],
             "order": order,
-            # Frame 0 is the world's.
+            # Frame 0 is the world frame.
             "carriers": [order.index(k.parent) + 1 if k.parent >= 0 else 0 for k in first.links],
             **{f"parents{k}": [levels[k].index(j) for j in parents] for k, parents in enumerate(below)},
         }
@@ -112,8 +112,8 @@ class JointActions:
         return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
 
     def frames(self, joints: Tensor) -> Tensor:
-        """Transforms from the links' frames to the world, shape [T, batch, link, 4, 4], for joint positions,
-        shape [T, batch, joint]."""
+        """Transforms from the links' frames to the world, shape [T, batch, link, 4, 4], given joint
+        positions, shape [T, batch, joint]."""
         c = self._on(joints.device)
         positions = joints.index_select(-1, c["order"])[..., None, None]
         angle = positions * c["hinge"][..., None, None]
@@ -128,7 +128,7 @@ class JointActions:
         return _product(torch.cat([still, *world], dim=2).index_select(2, c["carriers"]), c["links"])
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
-        """Numbers of the chains on a device."""
+        """Chain constants on a device."""
         if device not in self._constants:
             c = {name: torch.tensor(array, device=device) for name, array in self._arrays.items()}
             x, y, z = c["axis"].unbind(-1)

@@ -1,4 +1,4 @@
-"""Kinematic trees of joints with limits, and links. Plain data and NumPy."""
+"""Kinematic trees of joints, with limits, and links, as plain data and NumPy arrays."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ BASE_JOINTS = {
 
 
 class ModelError(PlabError, ValueError):
-    """A model cannot be read or used; the one-line message names it."""
+    """Unreadable or unsupported model; the one-line message names it."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint and its transform relative to the parent frame: first ``offset``, then its own motion.
+    """A joint and its transform relative to the parent frame: first ``offset``, then the joint's motion.
 
     Attributes:
-        name: Its name.
-        parent: Index of the joint that carries it, -1 for the world.
-        offset: Transform from its frame at position 0 to the parent's frame.
-        hinge: Whether it rotates about the axis instead of sliding along it.
-        axis: Unit vector, in its own frame.
-        anchor: A point of the axis of a hinge, likewise [domain units].
+        name: Name.
+        parent: Index of the parent joint, -1 for the world.
+        offset: Transform from the joint frame at position 0 to the parent's frame.
+        hinge: Whether the joint rotates about the axis instead of sliding along it.
+        axis: Unit vector in the joint frame.
+        anchor: A point on a hinge's axis, in the joint frame [domain units].
         low: Lowest position [rad or domain units].
         high: Highest position.
         scale: Motion per environment step at action 1.
         start: Position at t = 0.
-        component: Index of the action component that moves it.
+        component: Index of the action component that moves the joint.
     """
 
     name: str
@@ -71,8 +71,8 @@ class Joint:
     component: int = 0
 
     def matrix(self, position: float) -> np.ndarray:
-        """Transform from its frame to the parent's, shape [4, 4]."""
-        # Imported here, as below, because it takes half a second and few scenes have a model.
+        """Transform from the joint frame to the parent's, shape [4, 4]."""
+        # Imported here and below, because it takes half a second and few scenes have a model.
         from scipy.spatial.transform import Rotation
 
         own, axis, anchor = np.eye(4), np.array(self.axis), np.array(self.anchor)
@@ -89,8 +89,8 @@ class Link:
     """A rigid link.
 
     Attributes:
-        parent: Index of the joint that carries it, -1 for the world.
-        offset: Transform from the link's frame, in which its shape is, to that of the joint.
+        parent: Index of the joint that the link is attached to, -1 for the world.
+        offset: Transform from the link frame, in which its shape is defined, to the joint frame.
         shape: Key of :data:`plab.scenes.MANIPULATOR_SHAPES`, with the motion ``twist``.
         size: Lengths of the shape [domain units].
     """
@@ -108,7 +108,7 @@ class Chain:
     Attributes:
         joints: Joints; a parent comes before its children.
         links: Links, in the order of the scene's last manipulators.
-        components: Names of the components of its action; each is clipped to [-1, 1].
+        components: Names of the action components; each is clipped to [-1, 1].
     """
 
     joints: tuple[Joint, ...]
@@ -117,12 +117,12 @@ class Chain:
 
     @property
     def topology(self) -> tuple[object, ...]:
-        """Structure that must be equal for all scenes of a simulator."""
+        """Structure that all scenes of a simulator must share."""
         joints = tuple((joint.parent, joint.hinge, joint.component) for joint in self.joints)
         return joints, tuple((link.parent, link.shape) for link in self.links)
 
     def frames(self, positions: Sequence[float]) -> np.ndarray:
-        """Transforms from the links' frames to the world, shape [link, 4, 4], for joint positions, shape
+        """Transforms from the links' frames to the world, shape [link, 4, 4], given joint positions, shape
         [joint]."""
         world: list[np.ndarray] = []
         for joint, position in zip(self.joints, positions, strict=True):
@@ -134,7 +134,7 @@ class Chain:
 
     @staticmethod
     def action_map(scenes: Sequence[Scene]) -> JointActions:
-        """Map from actions to twists, for a batch of scenes with chains of one topology."""
+        """Map from actions to twists, for a batch of scenes whose chains share one topology."""
         # Imported here, because reading configurations does not need PyTorch.
         from plab.kinematics.actions import JointActions
 
@@ -166,17 +166,17 @@ class Chain:
         limits: Mapping[str, Sequence[float]],
         together: Mapping[str, str],
     ) -> Chain:
-        """Place a model in a scene, with the joints that are to move.
+        """Place a model in a scene, and select the joints that move.
 
         Args:
             position: Origin of the model [domain units].
             rotation: Quaternion w, x, y, z from the model's axes to the world's.
             free: Whether the base can move, by :data:`BASE_JOINTS`.
             scale: Motion per environment step at action 1, by patterns of joint names; the last match
-                applies. Joints without one are fixed.
+                applies. Joints without a scale are fixed.
             start: Positions at t = 0, by patterns.
             limits: Lowest and highest positions, likewise; default: the model's.
-            together: Patterns of joints that one component of the action moves, by its name.
+            together: Patterns of joints that share one action component, by the component's name.
 
         Raises:
             ModelError: If a pattern matches no joint, an initial position is outside its limits, or no joint
@@ -215,7 +215,7 @@ class Chain:
             joints[k] = replace(joint, low=low, high=high, start=at, scale=scales.get(joint.name, 0.0))
         components = list(dict.fromkeys(shared.get(one.name, one.name) for one in joints if one.scale))
         if not components:
-            raise ModelError("scale: no joint moves: set the scale of at least one joint")
+            raise ModelError("scale: no joint moves; set the scale of at least one joint")
         numbered = [
             replace(one, component=components.index(shared.get(one.name, one.name)) if one.scale else 0)
             for one in joints
@@ -223,7 +223,7 @@ class Chain:
         return Chain(tuple(numbered), tuple(links), tuple(components)).moving()
 
     def moving(self) -> Chain:
-        """The same chain without fixed joints."""
+        """Copy of the chain without fixed joints."""
         kept: list[Joint] = []
         # For each joint: index of its new parent joint, and transform to its frame.
         frames: list[tuple[int, np.ndarray]] = []
@@ -248,8 +248,8 @@ class Chain:
 
 
 def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:
-    """Return values by name from a table with patterns, regular expressions of whole names; raise ModelError,
-    with a message that begins with ``key``, if one matches no name."""
+    """Return values by name from a table of patterns, which are regular expressions for whole names; raise
+    ModelError, with a message that begins with ``key``, if a pattern matches no name."""
     found: dict[str, Any] = {}
     for pattern, value in table.items():
         try:

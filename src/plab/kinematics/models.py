@@ -1,4 +1,4 @@
-"""Articulated models of MJCF and URDF files, read with the `mujoco` package."""
+"""Reader of articulated models in MJCF and URDF files, with the `mujoco` package."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _ALONG = ((0.5**0.5, 0.0, 0.0, -(0.5**0.5)), (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.
 def read_model(
     model: str, root: str | None = None, size: float = 1.0, omit: Sequence[str] = ()
 ) -> tuple[Chain, str]:
-    """Read the tree below a body of a model: hinges and slides, and collision geometry as links.
+    """Read the tree below a body of a model: hinges and slides as joints, collision geometry as links.
 
     Capsules, boxes, spheres and cylinders are used directly; meshes are replaced by a capsule or box of the
     size of their oriented bounding box. Visual geometry, planes and free joints are left out.
 
     Args:
-        model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
-        root: Body whose frame becomes the model's; default: the model's world frame.
+        model: MJCF or URDF file, or ``package:path`` of a file in an installed package.
+        root: Body whose frame becomes the model frame; default: the model's world frame.
         size: Domain units per unit of length of the model.
         omit: Patterns of names of geometry to leave out.
 
@@ -43,8 +43,8 @@ def read_model(
         all its numbers.
 
     Raises:
-        ModelError: If `mujoco`, the file, or the body is missing, something in it is not supported, or a
-            pattern matches nothing.
+        ModelError: If `mujoco`, the file or the body is missing, a feature is not supported, or a pattern
+            matches nothing.
     """
     package, colon, inside = model.partition(":")
     path = model
@@ -132,7 +132,7 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
 
 def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None, Any, np.ndarray]:
     """Return a link's shape, its lengths, and the transform from its frame to the geom's, given the geom's
-    MuJoCo type, its lengths [3], and its bounding box: centre and half edges [6]."""
+    MuJoCo type, lengths [3] and bounding box: centre and half edges [6]."""
     radius, half = lengths[:2]
     upright = pose_matrix((0.0, 0.0, 0.0), _ALONG[2])
     if kind == "SPHERE":

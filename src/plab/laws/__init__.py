@@ -1,4 +1,4 @@
-"""Constitutive laws, one per file: parameters, stress, time step limit."""
+"""Constitutive laws, one per file: parameters, stress and time step limit."""
 
 from plab.laws.law import Law, Parameter
 

@@ -23,22 +23,22 @@ SYM = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def transposed(a):
-    """A^T of a full matrix."""
+    """Transpose A^T of a full matrix."""
     return tuple(a[3 * k + i] for i in range(3) for k in range(3))
 
 
 def entry(a, b, i, j):
-    """Component i, j of A B, both full."""
+    """Component i, j of A B, for full matrices."""
     return total(a[3 * i + k] * b[3 * k + j] for k in range(3))
 
 
 def total(terms):
-    """Sum of the terms, in their order."""
+    """Sum of the terms, in order."""
     return reduce(operator.add, terms)
 
 
 def mul(a, b):
-    """A B, both full."""
+    """Product A B of full matrices."""
     return tuple(entry(a, b, i, j) for i in range(3) for j in range(3))
 
 
@@ -75,12 +75,12 @@ def inverse_sym(s):
 
 
 def outer_sym(a):
-    """A A^T of a full matrix, symmetric."""
+    """Product A A^T of a full matrix, symmetric."""
     return tuple(entry(a, transposed(a), i, j) for i, j in SYM)
 
 
 def square_sym(s):
-    """S S of a symmetric matrix, symmetric."""
+    """Square of a symmetric matrix."""
     return (
         s[0] * s[0] + s[3] * s[3] + s[4] * s[4],
         s[3] * s[3] + s[1] * s[1] + s[5] * s[5],
@@ -97,13 +97,13 @@ def mat_from_sym(s):
 
 
 def trial_gradient(c, f, dt):
-    """(I + dt C) F."""
+    """Trial deformation gradient (I + dt C) F."""
     cf = mul(c, f)
     return [f[i] + dt * cf[i] for i in range(9)]
 
 
 def mul_sym_mat(s, b):
-    """S B with S symmetric, B full."""
+    """Product S B of a symmetric and a full matrix."""
     return mul(mat_from_sym(s), b)
 
 
@@ -151,7 +151,8 @@ def inverse_cbrt(j, steps):
 
 
 def log_coefficients(i1, i2, i3, terms):
-    """Coefficients a1, a2 of Z and Z^2 in atanh(Z) by Horner's rule; that of I drops out of the deviator."""
+    """Coefficients a1, a2 of Z and Z^2 in atanh(Z) by Horner's rule; the coefficient of I drops out of the
+    deviator."""
     n13 = i1 * i3
     n23 = i3 - i1 * i2
     n33 = i1 * i1 - i2
@@ -162,7 +163,7 @@ def log_coefficients(i1, i2, i3, terms):
 
 
 def exp_coefficients(q, det_d, terms):
-    """Coefficients of I, d, d^2 in exp(d) for a traceless d with q = tr(d^2) / 2, by Horner's rule."""
+    """Coefficients of I, d, d^2 in exp(d) for a traceless d, given q = tr(d^2) / 2, by Horner's rule."""
     h0, h1, h2 = 0.0 * q + 1.0 / math.factorial(terms - 1), 0.0 * q, 0.0 * q
     for k in reversed(range(terms - 1)):
         h0, h1, h2 = det_d * h2 + 1.0 / math.factorial(k), h0 + q * h2, h1

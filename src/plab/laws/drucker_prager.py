@@ -32,7 +32,7 @@ def hencky(frame):
 
 
 def update(c, f, dt, mu, lam, alpha):
-    """Kirchhoff stress, and F after the substep."""
+    """Return the Kirchhoff stress, and F after the substep."""
     g = trial_gradient(c, f, dt)
     frame = PrincipalFrame(outer_sym(g))
     trace, deviator = hencky(frame)
@@ -45,13 +45,13 @@ def update(c, f, dt, mu, lam, alpha):
 
 
 def coefficients(youngs_modulus, poisson_ratio, friction_angle):
-    """Lame's parameters and alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi))."""
+    """Lamé's parameters and alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi))."""
     sine = sin_degrees(friction_angle)
     return *lame(youngs_modulus, poisson_ratio), math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
 
 
 def sin_degrees(angle):
-    """Sine of an angle [degrees] up to a right one, by its series."""
+    """Sine of an angle [degrees] up to 90, by its series."""
     x = angle * (math.pi / 180.0)
     out, square = 0.0 * x, x * x
     for k in reversed(range(1, 12)):

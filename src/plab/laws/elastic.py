@@ -14,7 +14,7 @@ def lame(youngs_modulus, poisson_ratio):
 
 
 def update(c, f, dt, mu, lam):
-    """Kirchhoff stress, and F after the substep."""
+    """Return the Kirchhoff stress, and F after the substep."""
     g = trial_gradient(c, f, dt)
     j, b = det(g), outer_sym(g)
     pressure = lam * j * (j - 1.0)

@@ -9,7 +9,7 @@ from plab.laws.law import Law, Parameter
 
 
 def update(c, f, dt, bulk_modulus, viscosity):
-    """Kirchhoff stress, and F after the substep."""
+    """Return the Kirchhoff stress, and F after the substep."""
     j = det(trial_gradient(c, f, dt))
     pressure = bulk_modulus * j * (j - 1.0)
     mean = (c[0] + c[4] + c[8]) * (1.0 / 3.0)
@@ -22,7 +22,7 @@ def update(c, f, dt, bulk_modulus, viscosity):
 FLUID = Law(
     name="fluid",
     parameters=(
-        Parameter("bulk_modulus", 5000.0, "(0, inf)", "Pa", "bulk modulus; the speed of sound is its root"),
+        Parameter("bulk_modulus", 5000.0, "(0, inf)", "Pa", "bulk modulus, the square of the speed of sound"),
         Parameter("viscosity", 0.1, "[0, inf)", "Pa s", "dynamic viscosity"),
     ),
     update=update,

@@ -20,7 +20,7 @@ class Parameter:
         name: Key in a task's YAML.
         default: Default value.
         interval: Admissible values, such as ``(0, inf)`` or ``[0, 0.5)``.
-        unit: Unit; empty for a number.
+        unit: Unit; empty if dimensionless.
         meaning: Short description.
     """
 
@@ -48,12 +48,12 @@ class Law:
 
     Attributes:
         name: Name in a task's YAML.
-        parameters: Its parameters, in the order in which functions and gradients have them.
-        update: From C (9), F (9), the time step and the coefficients to the Kirchhoff stress (6) and F after
-            the substep (9).
-        stiffness: From the coefficients to 3 lambda + 2 mu at rest [pressure].
+        parameters: Parameters, in the order used by functions and gradients.
+        update: Function of C (9), F (9), the time step and the coefficients that returns the Kirchhoff stress
+            (6) and F after the substep (9).
+        stiffness: Function of the coefficients that returns 3 lambda + 2 mu at rest [pressure].
         coefficients: Function that converts the parameters to coefficients of ``update``; default: identity.
-        viscosity: From the coefficients to the largest dynamic viscosity [pressure x s].
+        viscosity: Function of the coefficients that returns the largest dynamic viscosity [pressure x s].
     """
 
     name: str

@@ -1,5 +1,4 @@
-"""Principal stretches: eigenvalues and directions of b = G G^T, and symmetric tensors with the same
-directions.
+"""Principal stretches: eigenvalues and directions of b = G G^T, and symmetric tensors with these directions.
 
 Jacobi's method with a fixed number of sweeps and no branches. The derivative is that of an isotropic tensor
 function: eigenvalues in fixed directions, and rotations of the directions by divided differences, with their
@@ -18,7 +17,7 @@ TINY = 1e-30
 """Regularisation, so that the tangent of a rotation is 0 for diagonal tensors."""
 
 CLOSE = 3e-4
-"""Relative distance of two eigenvalues below which a divided difference is taken at its limit."""
+"""Relative distance of two eigenvalues below which a divided difference is replaced by its limit."""
 
 _OFF = {(0, 1): 3, (0, 2): 4, (1, 2): 5}
 
@@ -27,7 +26,7 @@ class PrincipalFrame:
     """Principal directions of a symmetric tensor.
 
     Attributes:
-        values: The three eigenvalues, in no order.
+        values: The three eigenvalues, unordered.
     """
 
     def __init__(self, b):
@@ -56,7 +55,7 @@ class PrincipalFrame:
         self.values = [self._component(i, i) for i in range(3)] if isinstance(b[0], Node) else s[:3]
 
     def _component(self, i, j):
-        """Component of the tensor along two of the directions."""
+        """Component of the tensor along two principal directions."""
         full = mat_from_sym(self._b)
         row = [total(full[3 * r + c] * self._axes[j][c] for c in range(3)) for r in range(3)]
         return total(x * y for x, y in zip(self._axes[i], row, strict=True))
@@ -84,7 +83,7 @@ class PrincipalFrame:
         return np.where(apart, difference, 0.5 * (slopes[0] + slopes[1]))
 
     def _slope(self, value, own, other):
-        """Limit of the divided difference where two eigenvalues are equal."""
+        """Limit of the divided difference for equal eigenvalues."""
         if not isinstance(value, Node):
             return 0.0
         by_own, by_other = derivatives([value], [1.0], [self.values[own], self.values[other]])

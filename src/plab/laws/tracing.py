@@ -74,7 +74,7 @@ class Node:
         return self.trace.node("less", other, self)
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
-        """Record a NumPy function of numbers, or an operator with a NumPy number on the left."""
+        """Record a NumPy function, or an operator whose left operand is a NumPy number."""
         if function in OPERATORS:
             left, right = given
             return OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
@@ -94,11 +94,11 @@ OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
     np.multiply: operator.mul,
     np.divide: operator.truediv,
 }
-"""Operators that NumPy's numbers call as functions."""
+"""Operators that NumPy numbers call as functions."""
 
 
 def frozen(number: Number) -> Number:
-    """Return a number that is treated as constant in derivatives."""
+    """Return a number that derivatives treat as constant."""
     return number.trace.node("frozen", number) if isinstance(number, Node) else number
 
 
@@ -110,7 +110,7 @@ class Trace:
         self._known: dict[tuple[Any, ...], Node] = {}
 
     def inputs(self, name: str, count: int) -> list[Node]:
-        """Return new inputs; ``name`` distinguishes them from others."""
+        """Return new inputs; ``name`` distinguishes them from other inputs."""
         return [self.node("input", f"{name}{k}") for k in range(count)]
 
     def node(self, operation: str | Primitive, *arguments: Number) -> Node:
@@ -122,7 +122,7 @@ class Trace:
         return self._known[key]
 
     def sum(self, a: Number, b: Number) -> Number:
-        """a + b."""
+        """Record a + b."""
         if _equals(a, 0.0) or _equals(b, 0.0):
             return b if _equals(a, 0.0) else a
         if _negated(b):
@@ -130,13 +130,13 @@ class Trace:
         return self.difference(b, a.arguments[0]) if _negated(a) else self.node("add", a, b)
 
     def difference(self, a: Number, b: Number) -> Number:
-        """a - b."""
+        """Record a - b."""
         if _equals(a, 0.0) or _equals(b, 0.0):
             return -b if _equals(a, 0.0) else a
         return self.sum(a, b.arguments[0]) if _negated(b) else self.node("sub", a, b)
 
     def product(self, a: Number, b: Number) -> Number:
-        """a b."""
+        """Record a b."""
         if not isinstance(b, Node):
             a, b = b, a
         if not isinstance(a, Node):
@@ -195,7 +195,7 @@ def _shares(node: Node, bar: Number) -> Sequence[Number]:
 
 
 def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Sequence[Node]) -> list[Number]:
-    """Return the adjoints of some nodes from those of outputs.
+    """Return the adjoints of some nodes, given those of the outputs.
 
     Args:
         outputs: Outputs of the trace.
@@ -239,7 +239,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def evaluated(outputs: Sequence[Number], given: Mapping[Node, Any]) -> list[Any]:
-    """Compute nodes.
+    """Evaluate nodes.
 
     Args:
         outputs: Nodes or constants.

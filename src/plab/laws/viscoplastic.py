@@ -20,11 +20,11 @@ NEWTON_STEPS = 6
 FLOW_MIN = 1e-30
 
 LEAST = 1e-12
-"""Lower bound of the relative overstress that is raised to a power."""
+"""Lower bound of the relative overstress before it is raised to a power."""
 
 
 def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
-    """Kirchhoff stress, and F after the substep."""
+    """Return the Kirchhoff stress, and F after the substep."""
     g = trial_gradient(c, f, dt)
     frame = PrincipalFrame(outer_sym(g))
     trace, deviator = hencky(frame)
@@ -37,7 +37,7 @@ def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
 
 
 def overstress(trial, dt, mu, consistency, power):
-    """Overstress x after the substep from the trial one.
+    """Overstress x after the substep, given the trial overstress.
 
     It solves x + sqrt(2) mu dt (x / (sqrt(2) consistency))^power = trial, by Newton's method in x / trial.
     The derivative is taken at the last step.

@@ -42,8 +42,8 @@ NORM_SHIFT = 1e-8
 
 
 def hencky_strain(g, j, series):
-    """Deviatoric Hencky strain d of G, after its intermediate results: c2, W = (b + I)^-1 (6), Z (6), |Z|^2,
-    the coefficients a1, a2 of Z and Z^2 in d."""
+    """Deviatoric Hencky strain d of G, preceded by its intermediate results: c2, W = (b + I)^-1 (6), Z (6),
+    |Z|^2, the coefficients a1, a2 of Z and Z^2 in d."""
     c2 = series.unimodular_scale(j)
     b = outer_sym(g)
     shifted = (c2 * b[0] + 1.0, c2 * b[1] + 1.0, c2 * b[2] + 1.0, c2 * b[3], c2 * b[4], c2 * b[5])
@@ -79,7 +79,7 @@ def stress(d, j, c2, mu, lam, yield_strain, series):
 
 
 def flow(d, g, yield_strain, series):
-    """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
+    """F' = exp((k - 1) d) G (9 components); G itself without yielding."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     s = k - 1.0
     m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
@@ -88,7 +88,7 @@ def flow(d, g, yield_strain, series):
 
 
 def yield_factor(d, yield_strain):
-    """q = tr(d^2) / 2, det d, the regularised norm of d and the factor k of return mapping."""
+    """q = tr(d^2) / 2, det d, the regularised norm of d, and the factor k of return mapping."""
     q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
     norm = np.sqrt(2.0 * q + NORM_SHIFT)
     return q, det_sym(d), norm, np.minimum(yield_strain / norm, 1.0)
@@ -104,7 +104,7 @@ def update(c, f, dt, mu, lam, yield_strain):
 
 
 YIELD_STRAIN_MAX = 1e30
-"""Represents infinity, which would give NaN in the unused branch."""
+"""Stands for infinity, which would give NaN in the unused branch."""
 
 
 def coefficients(youngs_modulus, poisson_ratio, yield_stress):

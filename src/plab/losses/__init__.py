@@ -1,4 +1,4 @@
-"""Losses: functions of a state, and their gradients, one file per term.
+"""Loss terms: functions of a state and their gradients, one file per term.
 
 :data:`TERMS` lists the terms. Columns of results, entries of ``info`` and labels of reports follow from the
 weights of a configuration. Terms are imported on creation, so that their names are available without Taichi.
@@ -21,7 +21,7 @@ __all__ = ["TERMS", "check_gradient", "make_terms"]
 
 
 def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> tuple[Term, ...]:
-    """Create the terms of a loss, and the overlap with the target for scores.
+    """Create the terms of a loss, including the overlap with the target, from which scores are computed.
 
     Args:
         weights: Weight of each term by its name, each at least 0; a term of weight 0 is left out.
@@ -32,7 +32,7 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
         New terms, for one simulator.
 
     Raises:
-        ConfigError: If there is no such term.
+        ConfigError: If a term does not exist.
     """
     # Imported here, as the terms are.
     from plab.losses.overlap import Overlap

@@ -20,7 +20,7 @@ FAR = 1e9
 """Initial value for the squared distance of the nearest particle [domain units^2]."""
 
 EQUAL = 1.0 + 1e-6
-"""Tolerance factor for the least squared distance, because recomputing it may round differently."""
+"""Tolerance factor for the smallest squared distance, because recomputing it may round differently."""
 
 
 class Chamfer(ParticleTerm):
@@ -31,7 +31,7 @@ class Chamfer(ParticleTerm):
     unit = "domain units^2"
 
     def attach(self, sim) -> None:
-        """Allocate points, and the squared distances of the nearest particles from them."""
+        """Allocate the target points and their squared distances to the nearest particles."""
         super().attach(sim)
         shape = (sim.batch, POINTS)
         self.points = sim.share(ti.Vector.field(3, sim.real, shape=shape))
@@ -39,7 +39,7 @@ class Chamfer(ParticleTerm):
         self.found = ti.field(sim.real, shape=shape)
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Compute the points of the targets."""
+        """Compute the points of new targets."""
         made = {own.tobytes(): own for own in mass}
         points = {key: mass_portions(own, POINTS) for key, own in made.items()}
         self.sim.write(self.points, np.stack([points[own.tobytes()] for own in mass]))
@@ -47,7 +47,7 @@ class Chamfer(ParticleTerm):
 
     @ti.func
     def measure(self, e, x, v):
-        """Return the particle's contribution; record where it is the nearest particle."""
+        """Return a particle's contribution; record the points to which it is the nearest particle."""
         least = ti.cast(FAR, self.sim.real)
         for k in range(POINTS):
             d = (x - self.points[e, k]).norm_sqr()
@@ -68,8 +68,8 @@ class Chamfer(ParticleTerm):
 
     @ti.func
     def gradient(self, e, x, v):
-        """Derivative of the distances to the nearest point, and to the points whose nearest particle this
-        is."""
+        """Derivative of the distance to the nearest point, and of the distances to the points whose nearest
+        particle this is."""
         least = ti.cast(FAR, self.sim.real)
         way = 0.0 * x
         x_bar = 0.0 * x

@@ -1,4 +1,4 @@
-"""Check of a term's gradient by central differences of its measure."""
+"""Check of a loss term's gradient against central differences of its measure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DISTURBANCE = 0.02
 def check_gradient(
     term: Term, scenes: Sequence[Scene], *, device: str = "cpu", directions: int = 4, seed: int = 0
 ) -> dict[str, float]:
-    """Compare a term's gradient with central differences of its measure, in float64 at a disturbed state.
+    """Compare a term's gradient with central differences of its measure, in float64, at a perturbed state.
 
     The targets are random, particles move, and manipulators are displaced and rotated. Differences across
     kinks of a term, such as equal mass and target mass, are invalid, but random states are not close to
@@ -79,13 +79,13 @@ def check_gradient(
 
 
 def _free(scene: Scene) -> np.ndarray:
-    """Mask of the manipulators' pose numbers that can change, 1 or 0, shape [manipulator, 8]."""
+    """Mask of the manipulators' pose components that can change, 1 or 0, shape [manipulator, 8]."""
     kinds = [MANIPULATOR_SHAPES[m.shape] for m in scene.manipulators]
     return np.array([[kind.moves] * 3 + [kind.turns] * 4 + [kind.grips] for kind in kinds], float)
 
 
 def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:
-    """The initial state with moving particles, and displaced and rotated manipulators."""
+    """Initial state with moving particles, and displaced and rotated manipulators."""
     rest = simulator.state()
     poses = rest.poses.copy()
     poses[..., :3] += rng.normal(scale=DISTURBANCE, size=poses[..., :3].shape)

@@ -52,13 +52,13 @@ class NearestContact(DistanceTerm):
 
     @ti.func
     def measure(self, accumulator):
-        """D^2."""
+        """Squared distance D^2."""
         nearest = ti.max(accumulator[0], 0.0)
         return nearest * nearest
 
     @ti.func
     def slope(self, accumulator, d, particle):
-        """2 D for the nearest particle, 0 for the others."""
+        """Derivative 2 D for the nearest particle, 0 for the others."""
         out = 0.0 * accumulator[0]
         if ti.cast(particle, ti.f64) == accumulator[1]:
             out = 2.0 * ti.max(accumulator[0], 0.0)
@@ -66,10 +66,11 @@ class NearestContact(DistanceTerm):
 
 
 class AllContact(NearestContact):
-    """The nearest distance; in the adjoint every particle outside receives the derivative of the nearest one.
+    """Squared nearest distance; in the adjoint, every particle outside receives the derivative of the nearest
+    one.
 
-    This results from the release's differentiation of an atomic minimum as an addition. It attracts a
-    manipulator to the whole body, ten thousand times as strongly as the true gradient.
+    The release differentiates an atomic minimum like an addition. The result attracts a manipulator to the
+    whole body, ten thousand times as strongly as the true gradient.
     """
 
     label = f"{NearestContact.label}; gradient summed over all particles"
@@ -77,7 +78,7 @@ class AllContact(NearestContact):
 
     @ti.func
     def slope(self, accumulator, d, particle):
-        """2 D for all particles outside."""
+        """Derivative 2 D for all particles outside."""
         out = 0.0 * accumulator[0]
         if d > 0.0:
             out = 2.0 * ti.max(accumulator[0], 0.0)
@@ -85,7 +86,7 @@ class AllContact(NearestContact):
 
 
 class SoftContact(DistanceTerm):
-    """Squared weighted mean of the distances, dominated by near particles."""
+    """Squared weighted mean of the distances, dominated by nearby particles."""
 
     name = "contact"
     label = "squared soft minima of the moving manipulators' distances to the particles"
@@ -100,13 +101,13 @@ class SoftContact(DistanceTerm):
 
     @ti.func
     def measure(self, accumulator):
-        """D^2."""
+        """Squared mean distance D^2."""
         mean = accumulator[1] / accumulator[0]
         return mean * mean
 
     @ti.func
     def slope(self, accumulator, d, particle):
-        """2 D dD/dd, with dD/dd = (w + w' (d - D)) / sum w."""
+        """Derivative 2 D dD/dd, with dD/dd = (w + w' (d - D)) / sum w."""
         out = 0.0 * accumulator[0]
         if d > 0.0:
             outside = ti.cast(d, ti.f64)

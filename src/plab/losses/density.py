@@ -9,14 +9,14 @@ __all__ = ["Density"]
 
 
 class Density(NodeTerm):
-    """Sum over the grid of the absolute difference of mass S and target mass S*, as in the paper."""
+    """Sum over the grid of the absolute difference between mass S and target mass S*, as in the paper."""
 
     name = "density"
     label = "sum over the grid of |mass - target mass|"
     unit = "mass"
 
     def attach(self, sim) -> None:
-        """Request the target's mass tensor, and compute its sum."""
+        """Request the target's mass tensor, and allocate its sum."""
         super().attach(sim)
         self.target = sim.reference("mass")
         self.total = sim.share(ti.field(ti.f64, shape=sim.batch))
@@ -28,12 +28,12 @@ class Density(NodeTerm):
 
     @ti.func
     def empty(self, e):
-        """The target's mass."""
+        """Total mass of the target."""
         return self.total[e]
 
     @ti.func
     def measure(self, e, node, mass):
-        """|S - S*| - |S*|."""
+        """Contribution |S - S*| - |S*|."""
         target = self.target[self.sim.entry(e, node)]
         return ti.abs(mass - target) - ti.abs(target)
 

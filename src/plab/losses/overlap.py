@@ -12,7 +12,7 @@ __all__ = ["Overlap"]
 
 
 class Overlap(NodeTerm):
-    """Sum over the grid of mass times target mass, and from it the soft IoU."""
+    """Sum over the grid of mass times target mass, from which the soft IoU is computed."""
 
     name = "overlap"
     label = "sum over the grid of mass times target mass"
@@ -27,17 +27,17 @@ class Overlap(NodeTerm):
         self._total = sim.mass * sim.particles
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Keep the sums and the peaks of the targets."""
+        """Store the sums and maxima of the targets."""
         self._scale = Constants([mass.sum(axis=(1, 2, 3)), mass.max(axis=(1, 2, 3))])
 
     @ti.func
     def measure(self, e, node, mass):
-        """S S*."""
+        """Contribution S S*."""
         return self.target[self.sim.entry(e, node)] * mass
 
     def iou(self, overlap: Any, peak: Any) -> Any:
-        """Return soft IoUs with the targets, as :func:`plab.objective.soft_iou` defines them, from this
-        term's measure and the largest mass of a node, shape [..., batch]; arrays or CUDA tensors."""
+        """Return the soft IoUs with the targets, see :func:`plab.objective.soft_iou`, given this term's
+        measure and the largest node mass, shape [..., batch]; arrays or CUDA tensors."""
         target_sum, target_peak = self._scale.like(overlap)
         with np.errstate(invalid="ignore", divide="ignore"):
             both = overlap / (peak * target_peak)

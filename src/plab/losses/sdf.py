@@ -20,10 +20,10 @@ class Sdf(NodeTerm):
 
     @ti.func
     def measure(self, e, node, mass):
-        """sdf* S."""
+        """Contribution sdf* S."""
         return self.target_sdf[self.sim.entry(e, node)] * mass
 
     @ti.func
     def slope(self, e, node, mass):
-        """sdf*."""
+        """Derivative sdf*."""
         return self.target_sdf[self.sim.entry(e, node)]

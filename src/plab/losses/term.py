@@ -1,4 +1,4 @@
-"""Base classes of the terms of the loss: functions of grid nodes, of particles, or of distances.
+"""Base classes of loss terms: functions of grid nodes, of particles, or of distances.
 
 A term is a class with a few functions that Taichi compiles into the simulator's kernels, for CPU and CUDA. It
 depends only on the state: masses of nodes, positions and velocities of particles, distances to manipulators.
@@ -16,11 +16,11 @@ class Term:
     """Base class of loss terms; the subclasses below define the functions of each kind.
 
     Attributes:
-        name: Name of its weight; ``loss_<name>`` is its column in results and its entry in ``info``.
+        name: Name of the weight; ``loss_<name>`` is the column in results and the entry in ``info``.
         label: Description of the measure, for reports.
         unit: Unit of the measure, for reports.
         weight: Weight in the loss; with 0 the term is not compiled.
-        weighted: Whether it is part of the loss; otherwise it is only measured, without gradient.
+        weighted: Whether the term is part of the loss; otherwise it is only measured, without gradient.
         sim: The simulator's kernels, after :meth:`attach`: numbers such as ``batch``, ``particles``, ``n``,
             ``dx``, ``mass`` (of a particle) and ``real``, Taichi's type of the simulation's numbers.
     """
@@ -32,7 +32,7 @@ class Term:
     weighted: bool = True
 
     def attach(self, sim) -> None:
-        """Attach the term to a simulator and allocate fields. Called once."""
+        """Attach the term to a simulator and allocate fields; called once."""
         self.sim = sim
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
@@ -73,8 +73,8 @@ class ParticleTerm(Term):
 
     @ti.func
     def measure(self, e, x, v):
-        """Return the contribution of a particle of environment ``e`` at ``x`` [domain units] with velocity
-        ``v``."""
+        """Return the contribution of a particle of environment ``e`` with position ``x`` [domain units] and
+        velocity ``v``."""
         return 0.0 * x[0]
 
     @ti.func
@@ -95,8 +95,8 @@ class DistanceTerm(Term):
     particles are joined.
 
     Attributes:
-        nearest_only: The derivative with respect to a distance is nonzero for one particle only, whose number
-            is the second entry of the accumulator.
+        nearest_only: Whether the derivative with respect to a distance is nonzero for one particle only,
+            whose number is the second entry of the accumulator.
     """
 
     nearest_only: bool = False
@@ -113,7 +113,7 @@ class DistanceTerm(Term):
 
     @ti.func
     def join(self, accumulator, other):
-        """Join the accumulators of two groups of particles; must be symmetric."""
+        """Join the accumulators of two groups of particles; must be symmetric in them."""
         return accumulator + other
 
     @ti.func

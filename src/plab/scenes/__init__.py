@@ -1,4 +1,4 @@
-"""Scenes: bodies, materials, meshes, manipulators, cameras, and the particles sampled from bodies."""
+"""Scenes: bodies, materials, meshes, manipulators, cameras and particle sampling."""
 
 from plab.scenes import scene
 from plab.scenes.camera import Camera

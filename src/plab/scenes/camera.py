@@ -1,4 +1,4 @@
-"""Camera parameters: position, target and picture size."""
+"""Camera parameters: position, target and image size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plab.scenes.scene import SceneError, Vec3, vector3
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera, of an environment's observations or of rendered pictures.
+    """A perspective camera for an environment's observations or for rendered pictures.
 
     Attributes:
         position: Position [domain units].
@@ -20,7 +20,7 @@ class Camera:
         field_of_view: Vertical field of view [degrees], in (0, 180).
         size: Width and height of pictures [pixels].
         near: Near clipping depth [domain units], positive.
-        far: Far clipping depth [domain units], which is the depth of the background.
+        far: Far clipping depth [domain units], which is also the depth of the background.
     """
 
     position: Vec3
@@ -48,7 +48,7 @@ class Camera:
             raise SceneError(f"camera.near must be positive and below camera.far (got {self.near:g})")
 
     def axes(self) -> np.ndarray:
-        """Return the unit vectors to the right, up and backwards, in rows, shape [3, 3].
+        """Return the right, up and backward unit vectors in rows, shape [3, 3].
 
         A camera that looks straight down or up has -z or z at the top of its pictures.
         """
@@ -75,7 +75,7 @@ class Camera:
         return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
 
     def project(self, points: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
-        """Project points of the scene into a picture.
+        """Project points of the scene onto the image.
 
         Args:
             points: Positions [domain units], shape [..., 3].

@@ -1,4 +1,4 @@
-"""Solids bounded by a closed mesh of triangles: points inside, volume, thickness, random points.
+"""Solids bounded by a closed triangle mesh: points inside, volume, thickness and random points.
 
 Random points are tested in plain float64 arithmetic, so the same file gives the same points on all platforms.
 """
@@ -21,7 +21,7 @@ MESHES = (".obj", ".stl", ".ply")
 """Suffixes of mesh files."""
 
 _LEAST_SHARE = 1e-4
-"""Least fraction of the bounding box filled by a solid, because points inside are found by rejection."""
+"""Minimum fraction of its bounding box that a solid fills, because points inside are found by rejection."""
 
 _BLOCK = 8192
 """Number of points sampled at once. The samples depend on it, so it must not change."""
@@ -33,12 +33,12 @@ _MARGIN = 1e-12
 """Margin of the bounding box of a triangle, for rounding errors."""
 
 _TRIED = 1 << 15
-"""Number of sample points to compare the enclosed volume with that of the faces."""
+"""Number of sample points for comparing the enclosed volume with the volume computed from the faces."""
 
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
     """Return the mesh of an OBJ, STL or PLY file, found by :func:`plab.files.pinned` and cached by content;
-    raise ShapeError if it cannot be read, or does not bound a solid."""
+    raise ShapeError if the file cannot be read or does not bound a solid."""
     return _loaded(*pinned(file, sha256))
 
 
@@ -48,14 +48,14 @@ def _loaded(file: str, sha256: str) -> Mesh:
 
 
 def read_mesh(file: str, **options: Any) -> Any:
-    """Read an OBJ, STL or PLY file with ``trimesh.load`` as one of trimesh's objects with vertices; raise
-    ShapeError if it cannot be read, or trimesh is not installed."""
+    """Read an OBJ, STL or PLY file with ``trimesh.load`` as a trimesh object with vertices; raise ShapeError
+    if the file cannot be read or trimesh is not installed."""
     try:
         # Imported here, because it takes a second and is rarely needed.
         import trimesh
     except ImportError:
         raise ShapeError(f"{file} is read with trimesh: pip install 'plab[mesh]'") from None
-    # Without a handler, warnings of its parsers would be printed in addition to plab's message.
+    # Without a handler, warnings of trimesh's parsers would be printed in addition to plab's message.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     kind = Path(file).suffix[1:].lower()
     with warnings.catch_warnings():
@@ -73,7 +73,7 @@ def read_mesh(file: str, **options: Any) -> Any:
 class Mesh:
     """A solid centred at the origin, in units of the longest edge of its bounding box.
 
-    Meshes are equal if their files are.
+    Meshes are equal if their files are equal.
 
     Attributes:
         vertices: Vertices, shape [vertex, 3].
@@ -88,7 +88,7 @@ class Mesh:
     def __init__(self, file: str, sha256: str) -> None:
         """Read and check a mesh; see :func:`load_mesh` for arguments and errors."""
         if Path(file).suffix.lower() not in MESHES:
-            raise ShapeError(f"{file} is not a file of a mesh: give {', '.join(MESHES)}")
+            raise ShapeError(f"{file} is not a mesh file: use {', '.join(MESHES)}")
         self.sha256 = sha256
         surface = read_mesh(file, force="mesh")
         faces = np.asarray(getattr(surface, "faces", []))
@@ -117,12 +117,12 @@ class Mesh:
         return hash(self.sha256)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Return which points, shape [point, 3], are inside, by their winding numbers; bool, shape
-        [point]."""
+        """Return a mask of the points, shape [point, 3], that are inside according to their winding numbers;
+        bool, shape [point]."""
         winding, flat = np.zeros(len(points), dtype=np.int64), points[:, ::2]
         corners = self.vertices[:, ::2][self.faces]
         low, high = corners.min(axis=1) - _MARGIN, corners.max(axis=1) + _MARGIN
-        # Along one axis, the points between the ends of a triangle follow one another.
+        # Sorted along one axis, the points between the ends of a triangle are consecutive.
         orders = flat.argsort(axis=0)
         first, last = (
             np.stack([np.searchsorted(flat[orders[:, k], k], bound[:, k]) for k in (0, 1)])
@@ -144,8 +144,8 @@ class Mesh:
         return winding != 0
 
     def fill(self, count: int, draw: Callable[[tuple[int, int]], np.ndarray]) -> np.ndarray:
-        """Draw points uniformly inside, shape [count, 3]; ``draw`` returns uniform random numbers in [0, 1)
-        of a given shape."""
+        """Draw ``count`` points uniformly inside, shape [count, 3]; ``draw`` returns uniform random numbers
+        in [0, 1) of a given shape."""
         found, parts = 0, []
         while found < count:
             points = (draw((_BLOCK, 3)) - 0.5) * self.extent

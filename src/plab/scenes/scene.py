@@ -1,4 +1,4 @@
-"""Scenes: bodies of plasticine, manipulators, material and floor.
+"""Scenes: plasticine bodies, manipulators, materials and floor.
 
 A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It does not depend on Taichi,
 Hydra or Gymnasium, and is the input of the simulator, the reference implementation of the tests and the
@@ -50,7 +50,7 @@ CONVENTIONS = ("plab", "release")
 """Reference implementation whose convention applies: plab's own, or the PlasticineLab release's."""
 
 DEVICES = ("cpu", "cuda")
-"""Devices that a scene can be simulated on."""
+"""Devices for simulation."""
 
 PRECISIONS = ("float32", "float64")
 """Floating-point types of the simulation."""
@@ -80,20 +80,20 @@ Vec3 = tuple[float, float, float]
 
 
 def vector3(values: Sequence[float]) -> Vec3:
-    """Return three numbers as a tuple; raise ValueError if they are not three."""
+    """Return three numbers as a tuple; raise ValueError for any other length."""
     x, y, z = values
     return x, y, z
 
 
 def find_law(name: str) -> Law:
-    """Return a law by its name, or by ``module:NAME`` for a law outside plab; raise ConfigError if there is
-    none."""
+    """Return a law by name, or by ``module:NAME`` for a law outside plab; raise ConfigError if it does not
+    exist."""
     found: Law = LAWS.find(name, "law")
     return found
 
 
 class SceneError(PlabError, ValueError):
-    """A scene cannot be simulated; the message has the reason and a valid value."""
+    """Scene that cannot be simulated; the message has the reason and a valid value."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,12 @@ class Material:
 
     @property
     def kind(self) -> Law:
-        """The law."""
+        """The law object."""
         return find_law(self.law)
 
     @property
     def values(self) -> dict[str, float]:
-        """The law's parameters, in its order."""
+        """Values of the law's parameters, in order."""
         given = {key: getattr(self, key) for key in MATERIAL_KEYS} | dict(self.parameters)
         return {key: given.get(key, default) for key, default in self.kind.defaults.items()}
 
@@ -145,7 +145,7 @@ class Material:
         for name in dict(self.parameters):
             if name not in self.kind.keys:
                 raise SceneError(
-                    f"{label}{name} is no parameter of law {self.law}: {', '.join(self.kind.keys)}"
+                    f"{label}{name} is not a parameter of law {self.law}: {', '.join(self.kind.keys)}"
                 )
         for parameter in self.kind.parameters:
             value = self.values[parameter.name]
@@ -155,10 +155,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of plasticine, initially filled with uniformly sampled particles.
+    """A plasticine body, initially filled with uniformly sampled particles.
 
     Attributes are those of :class:`plab.config.BodyConfig`: ``shape``, ``center`` and ``size`` [domain
-    units], ``particles``, and its material; parts that are None are those of the scene.
+    units], ``particles``, and material parameters; parameters that are None are inherited from the scene.
     """
 
     shape: str
@@ -172,18 +172,18 @@ class Body:
     parameters: Mapping[str, float] | tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Make the parameters hashable."""
+        """Convert the parameters to a hashable form."""
         object.__setattr__(self, "parameters", tuple(sorted(dict(self.parameters).items())))
 
     @property
     def own_material(self) -> dict[str, Any]:
-        """Fields of its :class:`Material` that differ from the scene's."""
+        """:class:`Material` fields that differ from the scene's."""
         values = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law")}
         own = {key: value for key, value in values.items() if value is not None}
         return {**own, "parameters": self.parameters} if self.parameters else own
 
     def half_extent(self) -> np.ndarray:
-        """Half of the bounding box's edges, shape [3]."""
+        """Half edges of the bounding box, shape [3]."""
         return np.full(3, self.size[0]) if self.shape == "sphere" else np.asarray(self.size, dtype=float) / 2
 
     @property
@@ -194,7 +194,7 @@ class Body:
 
 @dataclass(frozen=True)
 class MeshBody(Body):
-    """A body in the shape of a mesh.
+    """A body with the shape of a mesh.
 
     Attributes:
         mesh: The mesh; ``center`` is the centre of its bounding box, ``size`` is ``(longest,)``, the longest
@@ -220,9 +220,9 @@ def make_body(
     sha256: str | None = None,
     **material: Any,
 ) -> Body:
-    """Create a body from a configuration, reading the mesh file if any.
+    """Create a body from a configuration, and read its mesh file, if any.
 
-    Arguments are fields of the :class:`Body` or :class:`MeshBody`, and for a mesh its OBJ, STL or PLY file
+    Arguments are fields of :class:`Body` or :class:`MeshBody`, and for a mesh its OBJ, STL or PLY file
     and SHA-256, see :func:`plab.files.pinned`.
 
     Raises:
@@ -259,9 +259,9 @@ class ManipulatorShape:
         motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation),
             ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
-        outline: Shape with the same surface; default: its own name.
-        support: Distance from its position to its farthest point in a direction, as a function of its sizes
-            and a unit vector [3] in its own frame; None for shapes that carry between their parts.
+        outline: Shape with the same surface; default: this shape.
+        support: Distance from the position to the farthest point in a direction, as a function of the sizes
+            and a unit vector [3] in the manipulator's frame; None for shapes that grip between their parts.
     """
 
     size_names: tuple[str, ...]
@@ -272,22 +272,22 @@ class ManipulatorShape:
 
     @property
     def moves(self) -> bool:
-        """True if an action moves it."""
+        """True if actions move the manipulator."""
         return self.motion != "static"
 
     @property
     def turns(self) -> bool:
-        """True if its rotation depends on the actions."""
+        """True if the rotation depends on the actions."""
         return self.motion in ("roll", "grip", "rigid", "twist")
 
     @property
     def scaled(self) -> bool:
-        """True if its actions are multiples of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
+        """True if actions are multiples of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
         return self.motion != "twist"
 
     @property
     def grips(self) -> bool:
-        """True if its gap depends on the actions."""
+        """True if the gap depends on the actions."""
         return self.motion == "grip"
 
 
@@ -343,8 +343,8 @@ class Manipulator:
     """One rigid, kinematic manipulator.
 
     Attributes are those of :class:`plab.config.ManipulatorConfig`. Lengths in ``size`` are named by
-    ``MANIPULATOR_SHAPES[shape].size_names``; bounds of the position are applied after every substep; other
-    shapes than chopsticks do not use ``gap`` and ``minimal_gap``.
+    ``MANIPULATOR_SHAPES[shape].size_names``. Bounds of the position are applied after every substep. Only
+    chopsticks use ``gap`` and ``minimal_gap``.
     """
 
     shape: str
@@ -360,7 +360,7 @@ class Manipulator:
 
     @property
     def kind(self) -> ManipulatorShape:
-        """Properties of its shape."""
+        """Properties of the shape."""
         return MANIPULATOR_SHAPES[self.shape]
 
     @property
@@ -374,8 +374,8 @@ class Manipulator:
         return len(self.kind.action_names)
 
     def largest_step(self) -> float:
-        """Upper bound of the displacement of any of its points in an environment step [domain units]; 0 for
-        links, whose motion is bounded by their model."""
+        """Upper bound of the displacement of any point of the manipulator in an environment step [domain
+        units]; 0 for links, whose motion is bounded by their model."""
         motion, scale = self.kind.motion, np.abs(self.scale)
         reach = sum(self.size) + self.gap
         if motion in ("static", "twist"):
@@ -395,21 +395,22 @@ class Scene:
         name: Task name, for messages.
         bodies: Bodies of plasticine.
         manipulators: Manipulators, in the order in which they act on the grid and in the action vector.
-        youngs_modulus: Young's modulus E of bodies without their own.
-        poisson_ratio: Their Poisson ratio nu.
-        yield_stress: Their von Mises yield stress; ``inf`` for purely elastic bodies.
-        floor_friction: Floor friction: 0 slips, 10 and more sticks, Coulomb-like in between.
+        youngs_modulus: Default Young's modulus E of bodies.
+        poisson_ratio: Default Poisson ratio nu.
+        yield_stress: Default von Mises yield stress; ``inf`` for purely elastic bodies.
+        floor_friction: Floor friction: 0 slips, 10 or more sticks, Coulomb friction in between.
         gravity: Acceleration added to every grid node; the suite's is (0, -30, 0).
         grid_size: Grid nodes per axis; node i is at i / grid_size.
         dt: Time step of one substep.
         substeps: Substeps per environment step.
         horizon: Environment steps per episode.
         particle_seed: Seed of the particles' positions.
-        sampling_convention: Random generator of these positions, one of :data:`CONVENTIONS`.
-        digits_convention: Treatment of rotations that are not quite of unit length, likewise: ``plab``
-            normalises them, ``release`` keeps the initial poses unchanged until the first motion.
-        floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's includes the
-            layer of nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
+        sampling_convention: Random generator for these positions, one of :data:`CONVENTIONS`.
+        digits_convention: Treatment of quaternions that are not exactly of unit length, one of
+            :data:`CONVENTIONS`: ``plab`` normalises them, ``release`` only after the first motion.
+        floor_stencil: Stencil of particles within half a cell of a lower face, one of :data:`CONVENTIONS`:
+            plab's includes the layer of nodes below the domain, the release's begins at node 0, with weights
+            from -0.25 to 1.125.
         kinematics: Articulated model whose links are the last manipulators; None without one.
     """
 
@@ -439,7 +440,7 @@ class Scene:
     @property
     def particle_volume(self) -> float:
         """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab
-        release. It cancels in the motion and only scales the mass tensor and therefore the loss."""
+        release. It cancels in the equations of motion, and only scales the mass tensor and thus the loss."""
         return (0.5 * self.dx) ** 2
 
     @property
@@ -449,12 +450,12 @@ class Scene:
 
     @property
     def material(self) -> Material:
-        """Material of bodies without their own."""
+        """Default material of bodies."""
         return Material(self.youngs_modulus, self.poisson_ratio, self.yield_stress)
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Materials of the bodies, one per body."""
+        """Materials of the bodies, in order."""
         return tuple(replace(self.material, **body.own_material) for body in self.bodies)
 
     @property
@@ -464,14 +465,14 @@ class Scene:
 
     @property
     def laws(self) -> tuple[str, ...]:
-        """Names of the laws of its materials: one, or one per body if any body has its own material."""
+        """Names of the laws of the materials: one, or one per body if any body has its own material."""
         return tuple(material.law for material in self.materials[: self.material_count]) or (
             self.material.law,
         )
 
     @property
     def particle_bodies(self) -> np.ndarray:
-        """Number of each particle's body, shape [particle]."""
+        """Index of each particle's body, shape [particle]."""
         return np.repeat(np.arange(len(self.bodies)), [body.particles for body in self.bodies])
 
     @property
@@ -481,7 +482,7 @@ class Scene:
 
     @property
     def tools(self) -> tuple[Manipulator, ...]:
-        """Manipulators with their own actions: all except the links of an articulated model."""
+        """Manipulators with action components of their own: all except the links of an articulated model."""
         links = len(self.kinematics.links) if self.kinematics else 0
         return self.manipulators[: len(self.manipulators) - links]
 
@@ -494,13 +495,13 @@ class Scene:
 
     @property
     def particle_count(self) -> int:
-        """Particles of all bodies."""
+        """Number of particles in all bodies."""
         return sum(b.particles for b in self.bodies)
 
     @property
     def stable_dt(self) -> float:
-        """Largest admissible time step [s], see :meth:`plab.laws.Law.largest_step`: that of the stiffest
-        body."""
+        """Largest admissible time step [s], limited by the stiffest body; see
+        :meth:`plab.laws.Law.largest_step`."""
         return self._stiffest.largest_step(self.dx)
 
     @property
@@ -509,7 +510,8 @@ class Scene:
         return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
 
     def facts(self) -> dict[str, Any]:
-        """Return the scene as plain data, except meshes, without values that bodies inherit from it."""
+        """Return the scene as plain data, without meshes and without values that bodies inherit from the
+        scene."""
         facts = asdict(self)
         if self.kinematics is None:
             del facts["kinematics"]
@@ -520,7 +522,8 @@ class Scene:
         return facts
 
     def validate(self) -> None:
-        """Raise SceneError, which names the field and a valid value, if the scene cannot be simulated."""
+        """Raise SceneError if the scene cannot be simulated; the message names the field and a valid
+        value."""
         _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):
@@ -562,7 +565,7 @@ class Scene:
         top = 1.0 - 3.0 * self.dx
         for name, middle, half in zip("xyz", body.center, body.half_extent(), strict=True):
             low, high = middle - half, middle + half
-            # Bodies rest on the floor at y = 0 exactly; rounding errors below it are tolerated.
+            # Bodies may rest on the floor at y = 0 exactly, so rounding errors below it are tolerated.
             _require(
                 low >= -1e-9 and high <= top + 1e-9,
                 f"{label}: reaches {name} = {low:.3g} .. {high:.3g}, outside the domain 0 .. {top:.4g}: "
@@ -600,7 +603,7 @@ class Scene:
         self._require_slow(f"{label}: scale {tool.scale}", tool.largest_step())
 
     def _require_slow(self, label: str, way: float) -> None:
-        """Reject motions of more than one cell per substep, which contact at nodes could miss."""
+        """Raise SceneError for motions of more than one cell per substep, which nodal contact could miss."""
         limit = self.substeps * self.dx
         if way > limit:
             raise SceneError(
@@ -615,7 +618,7 @@ def _require(condition: bool, message: str) -> None:
 
 
 def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
-    """Return the links of an articulated model as manipulators, where they are at t = 0."""
+    """Return the links of an articulated model as manipulators with their poses at t = 0."""
     from scipy.spatial.transform import Rotation
 
     frames = chain.frames([joint.start for joint in chain.joints])
@@ -629,8 +632,8 @@ def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
 
 def sample_particles(scene: Scene) -> np.ndarray:
     """Sample the initial particle positions [domain units], uniformly inside each body; shape [particle, 3],
-    float64, body after body. They depend only on ``particle_seed``, ``sampling_convention`` and the
-    bodies."""
+    float64, in the order of the bodies. They depend only on ``particle_seed``, ``sampling_convention`` and
+    the bodies."""
     # With seed 0 bitwise identical to the release's.
     release = scene.sampling_convention == "release"
     rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)

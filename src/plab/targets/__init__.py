@@ -1,4 +1,4 @@
-"""Target recipes, which generate mass tensors.
+"""Target recipes, which define and generate target mass tensors.
 
 A recipe is a dataclass; :data:`RECIPES` has them by name, as in ``target.recipe`` of a task's YAML. The
 remaining keys of ``target`` are the dataclass's fields. ``plab targets`` builds the targets of the suite.

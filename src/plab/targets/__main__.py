@@ -1,4 +1,4 @@
-"""``python -m plab.targets``: the same as ``plab targets``."""
+"""``python -m plab.targets``: alias of ``plab targets``."""
 
 from plab.cli.suite import targets
 

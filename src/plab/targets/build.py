@@ -1,4 +1,5 @@
-"""Mass tensors of the ``target`` sections of tasks, their cache, and files of the original release."""
+"""Mass tensors for the ``target`` sections of tasks, their cache, and target files of the original
+release."""
 
 from __future__ import annotations
 
@@ -43,7 +44,7 @@ RECIPES: Mapping[str, type[Recipe]] = Registry(
 
 
 def make_recipe(target: Mapping[str, Any]) -> Recipe:
-    """Convert the section ``target`` of a task, ``recipe`` and its parameters, to the recipe.
+    """Convert the ``target`` section of a task, ``recipe`` and its parameters, to a recipe.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist, is missing or has a wrong type.
@@ -53,7 +54,7 @@ def make_recipe(target: Mapping[str, Any]) -> Recipe:
 
 @functools.lru_cache(maxsize=64)
 def _made(pickled: bytes) -> Recipe:
-    """Create the recipe of a pickled section ``target``, cached because OmegaConf takes milliseconds."""
+    """Create the recipe of a pickled ``target`` section, cached because OmegaConf takes milliseconds."""
     parameters = pickle.loads(pickled)
     name = parameters.pop("recipe", None)
     kind = RECIPES.get(str(name))
@@ -70,13 +71,13 @@ def _made(pickled: bytes) -> Recipe:
 
 def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
     """Return the actions of a scripted target, in [-1, 1], shape [EPISODE_STEPS, A], or None for a target
-    without simulation; raise TargetError if a parameter has a wrong value."""
+    without simulation; raise TargetError if a parameter has an invalid value."""
     recipe: Any = make_recipe(target)
     return None if isinstance(recipe, TensorRecipe) else recipe.actions(scene)
 
 
 def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
-    """Check a section ``target`` without simulation; see :func:`demonstration` for arguments and errors."""
+    """Check a ``target`` section without simulation; see :func:`demonstration` for arguments and errors."""
     if demonstration(scene, target) is None:
         build_target(scene, target)
     _target_scene(scene, make_recipe(target))
@@ -86,8 +87,8 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
     """Return the mass tensor of a target without simulation, shape [n, n, n], float64.
 
     Raises:
-        TargetError: If a parameter has a wrong value, the shape leaves the domain, or the target has to be
-            simulated.
+        TargetError: If a parameter has an invalid value, the shape extends outside the domain, or the target
+            requires simulation.
     """
     recipe = make_recipe(target)
     if not isinstance(recipe, TensorRecipe):
@@ -98,8 +99,8 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
 def build_targets(
     simulator: Simulator, targets: Sequence[Mapping[str, Any]], *, rebuild: bool = False
 ) -> np.ndarray:
-    """Build the targets of a simulator's environments, simulating scripted ones that are not cached on disk
-    (with ``rebuild`` all); return the mass tensors, shape [batch, n, n, n], float64.
+    """Build the targets of a simulator's environments; return the mass tensors, shape [batch, n, n, n],
+    float64. Scripted targets that are not cached on disk are simulated (with ``rebuild``, all).
 
     The simulator is left in its initial state, in the hard contact model if targets were simulated.
 
@@ -136,7 +137,7 @@ def build_targets(
 
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
-    """Return the scene for simulating a target, with particle seed 0 and the recipe's material."""
+    """Return the scene for simulating a target, with particle seed 0 and the recipe's material parameters."""
     material: dict[str, Any] = getattr(recipe, "material", {})
     made_from = replace(scene, particle_seed=0, **material)
     if material:
@@ -152,7 +153,7 @@ PHYSICS_VERSION = 1
 targets."""
 
 RELEASE_PARTICLES = 10000
-"""Total mass of the release's targets [particle masses], independent of the scene."""
+"""Total masses of the release's targets [particle masses], independent of the scene."""
 
 MASS_TOLERANCE = 0.02
 """Largest relative error of a release target's total mass."""
@@ -173,7 +174,7 @@ class TargetStore:
         self._made_by = (simulator.precision, simulator.device)
 
     def path(self, scene: Scene, actions: np.ndarray) -> Path:
-        """Return the file of the target for a scene and a demonstration, shape [T, A]."""
+        """Return the cache file of the target for a scene and a demonstration, shape [T, A]."""
         # The horizon is ignored; meshes are identified by content.
         facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
         text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
@@ -195,7 +196,7 @@ class TargetStore:
         """Store a mass tensor, shape [n, n, n], if the folder is writable."""
         path = self.path(scene, actions)
         node = np.flatnonzero(mass)
-        # If the folder is not writable, the target is generated again next time.
+        # If the folder is not writable, the target is generated again each time.
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
@@ -204,7 +205,7 @@ class TargetStore:
 
 
 def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.ndarray:
-    """Load a target file of the original release, ``<Task>3D-v<k>.npy`` in ``folder``, for a scene of this
+    """Load a target file of the original release, ``<Task>3D-v<k>.npy`` in ``folder``, for a scene with this
     name, grid and mass.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Target recipes that need no simulation, and the classes of all recipes.
+"""Target recipes without simulation, and base classes of all recipes.
 
 Recipes for solids, filled with uniformly sampled points, and for files with a point cloud or a mass tensor.
 Total masses agree with the scene's.
@@ -28,35 +28,36 @@ EPISODE_STEPS = 50
 
 
 class TargetError(PlabError, ValueError):
-    """A target cannot be built; the message has the reason."""
+    """Target that cannot be built; the message has the reason."""
 
 
 class Recipe:
-    """A target recipe; subclasses are dataclasses with the keys of the section ``target`` as fields."""
+    """Base class of target recipes; subclasses are dataclasses whose fields are the keys of the ``target``
+    section."""
 
 
 class TensorRecipe(Recipe, ABC):
-    """A target without simulation."""
+    """Base class of targets without simulation."""
 
     @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
         """Return the mass tensor of a scene's target, shape [n, n, n], float64, with the scene's total mass;
-        raise TargetError if a parameter has a wrong value, or the shape leaves the domain."""
+        raise TargetError if a parameter has an invalid value or the shape extends outside the domain."""
 
 
 class PointsRecipe(TensorRecipe):
-    """A target made of points with the total mass of the scene's particles."""
+    """Base class of targets made of points with the total mass of the scene's particles."""
 
     @abstractmethod
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """Sample or read the points; positions [domain units], shape [point, 3]."""
+        """Sample or read the points; returns positions [domain units], shape [point, 3]."""
 
     def mass(self, scene: Scene) -> np.ndarray:
         points = self.sample(scene, np.random.default_rng(TARGET_SEED))
         top = 1.0 - 3.0 * scene.dx
         if not np.all((points >= -1e-9) & (points <= top + 1e-9)):
             raise TargetError(
-                f"the target reaches outside the domain 0 .. {top:.4g}: it covers "
+                f"the target extends outside the domain 0 .. {top:.4g}: it covers "
                 f"{points.min(0).round(3)} to {points.max(0).round(3)}"
             )
         share = scene.particle_count / len(points)
@@ -68,7 +69,7 @@ class PointsRecipe(TensorRecipe):
 
 @dataclass
 class TargetBody:
-    """One solid body of a target; attributes are those of :class:`plab.config.BodyConfig`."""
+    """A solid body of a target; attributes are those of :class:`plab.config.BodyConfig`."""
 
     shape: str
     center: list[float]
@@ -116,12 +117,12 @@ class BodiesTarget(PointsRecipe):
 
 @dataclass
 class RingTarget(PointsRecipe):
-    """A closed, level ring of square section around a manipulator.
+    """A closed, horizontal ring of square cross-section around a manipulator.
 
     Attributes:
         around: Index of the manipulator at the centre of the ring (x and z).
         radius: Mean radius [domain units].
-        section: Edge of the square section [domain units].
+        section: Edge of the square cross-section [domain units].
         floor: Height of the underside [domain units].
     """
 
@@ -190,7 +191,7 @@ class PointsTarget(PointsRecipe):
         if distance > scene.dx:
             raise TargetError(
                 f"target: half of the points of {self.file} are {distance:.2g} or more apart, above a cell, "
-                f"{scene.dx:.2g}: give more points, or a coarser grid"
+                f"{scene.dx:.2g}: use more points, or a coarser grid"
             )
         cells, enclosed = _filled(points, scene.grid_size)
         if self.fill:
@@ -198,8 +199,8 @@ class PointsTarget(PointsRecipe):
             return (inside + rng.random(inside.shape)) / scene.grid_size
         if enclosed > _LARGEST_HOLLOW:
             raise TargetError(
-                f"target: the points of {self.file} enclose empty space, {enclosed:.0%} of their solid: give "
-                "points inside it, too, or fill: true"
+                f"target: the points of {self.file} enclose empty space, {enclosed:.0%} of their solid: add "
+                "points inside it, or set fill: true"
             )
         return points
 
@@ -223,9 +224,9 @@ class MassTarget(TensorRecipe):
     """A mass tensor; node (i, j, k) is at (i, j, k) / n.
 
     Attributes:
-        file: NumPy array of shape [n, n, n], n as in ``sim.grid_size``, not negative but for rounding, which
-            counts as 0; found as those of :class:`PointsTarget` are.
-        sha256: SHA-256 of the file, likewise.
+        file: NumPy array of shape [n, n, n], n as in ``sim.grid_size``; negative values from rounding count
+            as 0. Relative paths are searched for as in :class:`PointsTarget`.
+        sha256: SHA-256 of the file, as in :class:`PointsTarget`.
     """
 
     file: str
@@ -243,7 +244,7 @@ class MassTarget(TensorRecipe):
 @lru_cache(maxsize=8)
 def read_points(file: str, _sha256: str = "") -> np.ndarray:
     """Return the positions in a NumPy, PLY or XYZ file, shape [point, 3], float64, cached by content; raise
-    ShapeError if the file cannot be read, or holds no points."""
+    ShapeError if the file cannot be read or contains no points."""
     kind = Path(file).suffix.lower()
     if kind == ".ply":
         from plab.scenes.mesh import read_mesh
@@ -255,7 +256,7 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
         except (OSError, ValueError) as error:
             raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
     else:
-        points = _numbers(file, "a point cloud: give .npy, .ply, .xyz")
+        points = _numbers(file, "a point cloud: use .npy, .ply or .xyz")
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
         shape = list(points.shape)
         raise ShapeError(f"{file} holds an array of shape {shape}, not finite points [point, 3]")
@@ -265,7 +266,7 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
 @lru_cache(maxsize=8)
 def _read_tensor(file: str, _sha256: str) -> np.ndarray:
     """Read a mass tensor, float64, cached by content."""
-    mass = _numbers(file, "a mass tensor: give .npy")
+    mass = _numbers(file, "a mass tensor: use .npy")
     below = -mass.clip(max=0.0).sum()
     if not np.isfinite(mass).all() or not below <= _NEGATIVE * mass.sum() or not mass.any():
         raise ShapeError(f"{file} must hold masses that are finite, not negative and not all 0")

@@ -1,4 +1,4 @@
-"""Scripted target recipes: the final state of a demonstration sampled with a seed.
+"""Scripted target recipes: the final state of a demonstration sampled from a seed.
 
 Each recipe samples the paths of the manipulators from the ranges in the task's YAML and converts them to
 actions; the target is the final shape in the hard contact model. Such configurations are therefore solvable,
@@ -29,25 +29,25 @@ DECIMALS = 4
 
 
 class _TooLong(Exception):
-    """A path does not fit into an episode."""
+    """Path that does not fit into an episode."""
 
 
 class ActionTrack:
     """Actions of one manipulator, ``tool``, built from a sequence of motions."""
 
     def __init__(self, manipulator: Manipulator) -> None:
-        """Start at the manipulator's position without steps."""
+        """Start without steps at the manipulator's position."""
         self.tool = manipulator
         self._scale = np.asarray(manipulator.scale)
         self._actions: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        """Environment steps so far."""
+        """Number of environment steps so far."""
         return len(self._actions)
 
     def go(self, way: ArrayLike, steps: int = 1) -> None:
-        """Add a uniform motion, one entry per action component [domain units or radians], in at least the
-        given number of steps, or more if the distance requires it."""
+        """Append a uniform motion, one entry per action component [domain units or radians], in the given
+        number of steps, or more if the distance requires it."""
         way = np.asarray(way, dtype=float)
         # A component that cannot move has scale 0.
         share = np.divide(way, self._scale, out=np.zeros_like(way), where=self._scale > 0)
@@ -60,18 +60,18 @@ class ActionTrack:
         self._actions += [np.zeros_like(self._scale)] * (until - len(self))
 
     def delay(self) -> None:
-        """Delay the whole motion, so that it ends with the episode."""
+        """Delay the whole motion so that it ends with the episode."""
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if there are
-        more."""
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if the motion is
+        longer."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
 
     def first(self, steps: int) -> np.ndarray:
-        """Return the actions of the given number of steps, shape [steps, A]; later ones are cut off."""
+        """Return the actions of the first ``steps`` steps, shape [steps, A]."""
         self.wait(steps)
         return np.clip(np.round(self._actions[:steps], DECIMALS), -1.0, 1.0)
 
@@ -81,9 +81,9 @@ class Script(Recipe):
     """A scripted demonstration.
 
     Attributes:
-        seed: Seed of the draws, >= 0.
-        youngs_modulus: Young's modulus E during the demonstration; default: the scene's, as for the following
-            keys. Bodies with their own material keep it.
+        seed: Random seed, >= 0.
+        youngs_modulus: Young's modulus E during the demonstration; default, as for the following keys: the
+            scene's. Bodies with their own material keep it.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress.
     """
@@ -101,8 +101,8 @@ class Script(Recipe):
         return {key: value for key, value in values.items() if value is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
-        """Draw the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; raise TargetError if a
-        parameter has a wrong value, or no sampled path fits into an episode."""
+        """Sample the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; raise TargetError if a
+        parameter has an invalid value or no sampled path fits into an episode."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         rng, movers = np.random.default_rng(self.seed), [m for m in scene.tools if m.action_dim]
@@ -116,14 +116,14 @@ class Script(Recipe):
         )
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
-        """Draw actions once; raise _TooLong if they do not fit into an episode."""
+        """Sample actions once; raise _TooLong if they do not fit into an episode."""
         if not tracks:
             raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
         self.plan(scene, tracks, rng)
         return np.concatenate([track.actions() for track in tracks], axis=1)
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """Draw one path for each moving manipulator."""
+        """Sample one path for each moving manipulator."""
 
 
 @dataclass
@@ -154,9 +154,9 @@ class DrawTarget(Script):
     """A pen draws connected straight strokes on the first body's top, and is lifted.
 
     Attributes:
-        strokes: Range of their number, both ends included.
+        strokes: Range of the number of strokes, inclusive.
         length: Range of a stroke's length [domain units].
-        margin: Least distance of stroke ends from the body's edges [domain units].
+        margin: Minimum distance of stroke ends from the body's edges [domain units].
         depth: Range of the tip's depth below the body's top [domain units].
     """
 
@@ -179,7 +179,8 @@ class DrawTarget(Script):
         track.go([0.0, depth + tool.size[1], 0.0])
 
     def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Sample a stroke [2] from a position [2] that ends within +-room [2] of the body's centre."""
+        """Sample a stroke [2] from a position [2] such that it ends within +-room [2] of the body's
+        centre."""
         for _ in range(DRAWS):
             angle, length = rng.uniform(0, 2 * math.pi), _draw(rng, "length", self.length)
             way = length * np.array([math.cos(angle), math.sin(angle)])
@@ -193,7 +194,7 @@ class DentTarget(Script):
     """A sphere pushes dents into the first body, each towards its centre.
 
     Attributes:
-        dents: Range of their number, both ends included.
+        dents: Range of the number of dents, inclusive.
         elevation: Range of the approach angle above the horizontal [rad].
         azimuth: Range of the approach angle about the vertical, from x towards z [rad].
         depth: Range of a dent's depth [domain units].
@@ -255,7 +256,7 @@ class RollTarget(Script):
 
 @dataclass
 class LiftTarget(Script):
-    """Chopsticks lift the first body, move it sideways and rotate it, so that its ends hang and trail.
+    """Chopsticks lift the first body, move it sideways and rotate it, so that its ends hang and trail behind.
 
     Attributes:
         height: Range of the lift [domain units].
@@ -274,7 +275,7 @@ class LiftTarget(Script):
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
         turn, x = _draw(rng, "turn", self.turn), _draw(rng, "x", self.x)
         sides = rng.choice([-1.0, 1.0], size=2)
-        # With faster motion the body slips.
+        # With faster motion the body would slip.
         lift = 20
         track.go([0.0, height, 0.0, 0.0, 0.0, 0.0, 0.0], lift)
         track.go([sides[0] * x, 0.0, z, 0.0, sides[1] * turn, 0.0, 0.0], EPISODE_STEPS - 10 - lift)
@@ -282,11 +283,11 @@ class LiftTarget(Script):
 
 @dataclass
 class CarryTarget(Script):
-    """Two spheres grip the last body, set it on the first and release it.
+    """Two spheres grip the last body, place it on the first and release it.
 
     Attributes:
         squeeze: Range of the depth to which each sphere presses into the body before the lift [domain units].
-        press: Range of the depth to which it is pressed onto the other body [domain units].
+        press: Range of the depth to which the body is pressed onto the other one [domain units].
     """
 
     squeeze: list[float]
@@ -314,13 +315,13 @@ class CarryTarget(Script):
 
 @dataclass
 class PushTarget(Script):
-    """A sphere between the legs of a table pushes one of them outwards, at the end of the episode: the rest
-    of the table stays where it is.
+    """A sphere between the legs of a table pushes one of them outwards at the end of the episode, while the
+    rest of the table stays in place.
 
     Attributes:
-        legs: Number of legs, which are the scene's first bodies.
+        legs: Number of legs; these are the scene's first bodies.
         distance: Range of the distance travelled after contact with the leg [domain units].
-        steps: Least number of environment steps; with more, the table follows.
+        steps: Minimum number of environment steps; in a slower push the table follows.
     """
 
     legs: int
@@ -344,12 +345,12 @@ class PushTarget(Script):
 
 @dataclass
 class Posture:
-    """Joint positions at the end of a part of a gesture.
+    """Joint positions at the end of one part of a gesture.
 
     Attributes:
-        joints: Ranges of positions by patterns of joints; joints of one pattern share one sample of the
-            relative position within the range. Other joints do not move.
-        steps: Least number of environment steps.
+        joints: Ranges of positions by patterns of joints. Joints that match one pattern share one sample of
+            the relative position within the range; other joints do not move.
+        steps: Minimum number of environment steps.
     """
 
     joints: dict[str, list[float]]
@@ -358,7 +359,7 @@ class Posture:
 
 @dataclass
 class GestureTarget(Script):
-    """An articulated model moves through a sequence of postures, and stays in the last.
+    """An articulated model moves through a sequence of postures and stays in the last one.
 
     Attributes:
         postures: The postures, in order.
@@ -367,7 +368,7 @@ class GestureTarget(Script):
     postures: list[Posture]
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
-        """See :meth:`Script.sample`."""
+        """Sample actions once; see :meth:`Script.sample`."""
         # Imported here: few tasks have an articulated model.
         from plab.kinematics.chain import matched
 
@@ -410,12 +411,12 @@ def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float
 def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
     """Sample an integer from a range, inclusive."""
     if len(limits) != 2 or not 1 <= limits[0] <= limits[1]:
-        raise TargetError(f"target.{name} must be a range [low, high] from 1 on, not {list(limits)}")
+        raise TargetError(f"target.{name} must be a range [low, high] with low >= 1, not {list(limits)}")
     return int(rng.integers(limits[0], limits[1] + 1))
 
 
 def _top(body: Body) -> float:
-    """Height of a body's top [domain units]."""
+    """Height of the top of a body [domain units]."""
     return body.center[1] + float(body.half_extent()[1])
 
 
@@ -435,7 +436,7 @@ def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
 
 
 def _arc(start: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
-    """Return points on a path around the origin from one point to another, without the start; both [3]."""
+    """Return points on an arc around the origin from one point to another, without the first; both [3]."""
     a, b = np.linalg.norm(start), np.linalg.norm(end)
     angle = math.acos(float(np.clip(start @ end / (a * b), -1.0, 1.0)))
     if angle < 1e-6:
