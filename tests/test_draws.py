@@ -17,6 +17,7 @@ from plab.config import ConfigError, load_config
 from plab.config.randomization import ranges_of
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
+from plab.objective import target_observation
 from plab.problem import Problem
 from plab.results import read
 from plab.runners import run_config
@@ -135,11 +136,11 @@ def test_what_is_drawn_is_what_is_simulated(vector) -> None:
 
 @pytest.mark.nightly
 def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() -> None:
-    cfg = load_config(["task=Rope", *COARSE])
+    cfg = load_config(["task=Rope", *COARSE, "observe_target=true"])
     batch = EpisodeBatch([cfg] * 2, randomize={"scenes": 3})
     env, seen = TensorEnv(batch), set()
     for _ in range(4):
-        env.reset()
+        observed = env.reset().cpu().numpy()
         numbers = batch.draws.info()["scene"]
         seen |= set(numbers.tolist())
         for e, scene in enumerate(batch.problem.scenes):
@@ -147,7 +148,9 @@ def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() 
                 ["task=Rope", "variant=random", f"seed_scene={1000 + int(numbers[e])}", *COARSE]
             )
             assert scene.manipulators[2].position == tuple(drawn.task.manipulators["pillar"].position)
-            np.testing.assert_allclose(batch.problem.target_mass[e], Problem([drawn]).target_mass[0])
+            mass, target = batch.problem.initial_mass[e], Problem([drawn]).target_mass[0]
+            np.testing.assert_allclose(batch.problem.target_mass[e], target)
+            np.testing.assert_allclose(observed[e, -14:], target_observation(mass, target), atol=1e-6)
     assert len(seen) > 1
     batch.close()
     ranges = {"bodies": {"box_1": {"yield_stress": [10.0, 20.0]}}}

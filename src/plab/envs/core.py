@@ -349,7 +349,9 @@ class EpisodeBatch:
         return self.problem.simulator
 
     def _new_observer(self) -> None:
-        self._observer = Observer(self.problem, self.configs[0])
+        # Changes by the caller invalidate the observations of random scenes.
+        known = dict if self.changed_by_hand else self.draws.target_observations
+        self._observer = Observer(self.problem, self.configs[0], known)
 
     @_alone
     def reset(

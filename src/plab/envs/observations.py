@@ -40,15 +40,20 @@ class Observer:
         constant: Number of last entries of an observation that are constant in an episode.
     """
 
-    def __init__(self, problem: Problem, cfg: Config) -> None:
-        """Select the entries for a configuration, and compute the constant ones."""
+    def __init__(
+        self, problem: Problem, cfg: Config, known: Callable[[], Mapping[int, np.ndarray]] = dict
+    ) -> None:
+        """Select the entries for a configuration, and compute the constant ones, except those that ``known``
+        returns by environment."""
         scene = problem.scenes[0]
         self.stride = _stride(scene, cfg.observe_particles)
         self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
         self._numbers = len(scene.manipulators) * 8
         size = len(problem.scenes)
         self.constant = TARGET_ENTRIES if cfg.observe_target else 0
-        self._target = Constants(_target_observations(problem) if cfg.observe_target else np.empty((size, 0)))
+        self._target = Constants(
+            _target_observations(problem, known()) if cfg.observe_target else np.empty((size, 0))
+        )
 
     def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
         """Return observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses,
@@ -347,13 +352,15 @@ def _count(scene: Scene, least: int) -> int:
     return len(range(0, scene.particle_count, _stride(scene, least)))
 
 
-def _target_observations(problem: Problem) -> np.ndarray:
-    """Return the description of each environment's target, shape [batch, 14]."""
-    pairs = list(zip(problem.initial_mass, problem.target_mass, strict=True))
+def _target_observations(problem: Problem, known: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Return the description of each environment's target, shape [batch, 14], given some of them."""
+    others = [e for e in range(len(problem.scenes)) if e not in known]
+    pairs = [(problem.initial_mass[e], problem.target_mass[e]) for e in others]
     # Targets may repeat within a batch.
     keys = [b"".join(mass.tobytes() for mass in masses) for masses in pairs]
     found = {key: target_observation(*masses) for key, masses in dict(zip(keys, pairs, strict=True)).items()}
-    return np.array([found[key] for key in keys])
+    every = {**known, **{e: found[key] for e, key in zip(others, keys, strict=True)}}
+    return np.array([every[e] for e in range(len(every))])
 
 
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:

@@ -30,6 +30,7 @@ from plab.config.randomization import (
     yaws,
 )
 from plab.errors import ArgumentError, located
+from plab.objective import spread_mass, target_observation
 from plab.problem import Problem, drawn_scenes, make_targets, target_distance
 from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator
@@ -40,7 +41,7 @@ Target = tuple[np.ndarray, np.ndarray]
 """Mass tensor of a target, and the distance to it."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Base:
     """A scene to be randomised: a sub-environment's own, or one of the random scenes."""
 
@@ -52,6 +53,13 @@ class _Base:
     def particles(self) -> np.ndarray:
         """Positions of the particles, shape [particle, 3]."""
         return sample_particles(self.scene)
+
+    @functools.cached_property
+    def target_observation(self) -> np.ndarray:
+        """Observation of the target in the initial state, shape [14]."""
+        scene = self.scene
+        mass = spread_mass(self.particles, scene.grid_size, scene.particle_mass, scene.floor_stencil)
+        return target_observation(mass, self.target[0])
 
 
 class EpisodeRandomizer:
@@ -105,6 +113,20 @@ class EpisodeRandomizer:
             key: np.array([values.get(key, np.full(np.shape(like), np.nan)) for values in self.values])
             for key, like in sorted(known.items())
         }
+
+    def target_observations(self) -> dict[int, np.ndarray]:
+        """Return the observations of the targets of environments in unmodified random scenes, which are
+        computed once per scene."""
+        known = {}
+        for e, values in enumerate(self.values):
+            base, turns, places = self._placed[e]
+            if (
+                SCENE in values
+                and self._targets[e] == (base, {})
+                and (turns, places) == ({}, _places(base.scene))
+            ):
+                known[e] = base.target_observation
+        return known
 
     def randomize_episodes(
         self, environments: Sequence[int], seeds: Sequence[Sequence[int]], given: Mapping[str, Any]
