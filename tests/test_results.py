@@ -231,7 +231,7 @@ def test_load_on_a_mixed_folder(tmp_path: Path, rng) -> None:
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["x"] = 1
     (tmp_path / "notes.txt").write_text("not a result")
-    with pytest.warns(UserWarning, match="left out 2 unreadable") as caught:
+    with pytest.warns(UserWarning, match="skipped 2 unreadable") as caught:
         table = load(tmp_path, keys=["task.yield_stress", "method.nothing"])
     assert "foreign.h5" in str(caught[0].message) and broken.path.name in str(caught[0].message)
     table = table.set_index("seed")

@@ -124,7 +124,7 @@ def test_unreadable_files_are_named_each_time(folder: Path) -> None:
     for _ in range(2):
         with pytest.warns(UserWarning, match=r"bad\.h5"):
             assert len(load(folder)) == 3
-        with pytest.warns(UserWarning, match=r"left out 1 unreadable file\(s\): .*bad\.h5"):
+        with pytest.warns(UserWarning, match=r"skipped 1 unreadable file\(s\): .*bad\.h5"):
             assert ask(folder, "SELECT count(*) FROM runs") == [(3,)]
     with pytest.raises(ResultsError, match="nowhere"):
         connect([folder, folder / "nowhere"])
@@ -137,7 +137,7 @@ def test_a_run_with_damaged_iterations_is_named_and_left_out_everywhere(folder: 
     image = bytearray(path.read_bytes())
     image[place + 2] ^= 0xFF
     path.write_bytes(image)
-    with pytest.warns(UserWarning, match=rf"left out 1 unreadable .*{path.name}"):
+    with pytest.warns(UserWarning, match=rf"skipped 1 unreadable .*{path.name}"):
         assert len(load(folder)) == 3
     with pytest.warns(UserWarning, match=path.name):
         assert ask(folder, "SELECT count(DISTINCT run) FROM iterations") == [(3,)]

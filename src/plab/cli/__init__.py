@@ -1,1 +1,1 @@
-"""Command lines, one module each, and shared arguments, tables and messages."""
+"""Command-line interface: one module per command group, and shared arguments, tables and messages."""

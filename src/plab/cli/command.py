@@ -1,4 +1,4 @@
-"""Shared parts of all commands: handling of errors and interrupts, parser, options, and tables."""
+"""Shared parts of all commands: errors and interrupts, parser, options and tables."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
     """Wrap a command to report errors in one line.
 
     Args:
-        main: Function of the arguments after the program's name that returns the exit code, None for 0.
+        main: Function of the arguments after the program's name that returns the exit code (None for 0).
 
     Returns:
-        The wrapped command, with the arguments of the process by default. It prints errors in one line, and
-        returns 2 for invalid input, 130 after Ctrl-C and SIGTERM, 141 for a closed output, and 70 for a bug.
-        With ``PLAB_TRACEBACK`` set, a bug is raised.
+        The wrapped command; its arguments default to those of the process. It prints errors in one line, and
+        returns 2 for invalid input, 130 after Ctrl-C and SIGTERM, 141 for closed output, and 70 for a bug.
+        With ``PLAB_TRACEBACK`` set, it raises exceptions caused by bugs.
     """
 
     @functools.wraps(main)
@@ -84,7 +84,7 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
 
 
 def _close_output() -> int:
-    """Discard further output, because standard output is closed; return the exit code."""
+    """Discard further output after standard output was closed; return the exit code."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -96,10 +96,10 @@ def _close_output() -> int:
 
 
 class Parser(ArgumentParser):
-    """The parser of a command, with a docstring as help; errors raise ArgumentError."""
+    """Command-line parser with a docstring as help; errors raise ArgumentError."""
 
     def __init__(self, name: str, text: str | None, **options: Any) -> None:
-        """Create a parser without arguments from a command's name and docstring: purpose, then examples."""
+        """Create a parser without arguments, given a command's name and docstring: purpose, then examples."""
         purpose, _, more = inspect.cleandoc(text or "").partition("\n\n")
         formed = RawDescriptionHelpFormatter
         super().__init__(name, description=purpose, epilog=more, formatter_class=formed, **options)
@@ -114,8 +114,8 @@ class Parser(ArgumentParser):
 
 
 def add_sources(parser: ArgumentParser, words: str = "") -> None:
-    """Add the argument ``sources``: results, and selections of runs, in any order."""
-    # Imported here, as below, because h5py takes a fifth of a second.
+    """Add the argument ``sources``: results and selections of runs, in any order."""
+    # Imported here and below, because h5py takes a fifth of a second.
     from plab.results.examples import EXAMPLES
 
     what = f"folder, file or archive of results, or one of {', '.join(EXAMPLES)} (default: results)"
@@ -153,12 +153,12 @@ def sources_and_words(
     words = [one for one in arguments if "=" in one and one[:8] != "results=" and not os.path.exists(one)]
     named = [one.removeprefix("results=") for one in arguments if one not in words]
     if not all(one.strip() for one in named):
-        raise ArgumentError("the name of a folder is empty: name one, or . for the working directory")
+        raise ArgumentError("the name of a folder is empty: set it, or use . for the working directory")
     return [results_source(one) for one in named or ([default] if default else [])], words
 
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
-    """Return the finished runs that match selections, all of one protocol; raise ResultsError if there are
+    """Return the finished runs that match selections, all from one protocol; raise ResultsError if there are
     none."""
     from plab.results.run_file import NAMES, ResultsError
     from plab.results.table import rows
@@ -191,7 +191,7 @@ def task_list(text: str) -> list[str]:
 def folder(text: str) -> Path:
     """Parse the name of a folder, which must not be empty."""
     if not text.strip():
-        raise ArgumentTypeError("is empty: name a folder, or . for the working directory")
+        raise ArgumentTypeError("is empty: name a folder, or use . for the working directory")
     return Path(text).expanduser()
 
 
@@ -199,12 +199,12 @@ def results_source(text: str) -> Path:
     """Parse a folder, file or archive of results, or the name of a bundled archive."""
     from plab.results.examples import EXAMPLES, resolve
 
-    # The path ./example would become the name.
+    # The path ./example would become the name example.
     return resolve(text) if text in EXAMPLES else folder(text)
 
 
 def to_write(text: str) -> Path:
-    """Parse the name of a file, and check that it can be written before any computation."""
+    """Parse a file name, and check before any computation that the file can be written."""
     path = folder(text)
     # Missing parent folders are created when writing.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
@@ -216,7 +216,7 @@ def to_write(text: str) -> Path:
 
 
 def require_writable(path: Path) -> None:
-    """Raise ArgumentError if a file cannot be written, before anything is computed."""
+    """Raise ArgumentError if a file cannot be written; call before any computation."""
     try:
         to_write(str(path))
     except ArgumentTypeError as error:
@@ -238,7 +238,7 @@ def measure_table(
 
     Args:
         columns: Names of the columns, in order.
-        rows: A value per column; each row is printed and written before the next is requested, so that
+        rows: One value per column; each row is printed and written before the next is requested, so that
             interruptions lose nothing.
         path: CSV file to write, or None.
         widths: Minimum widths of columns on the screen, if not the default.
@@ -278,12 +278,12 @@ def _write(path: Path, row: Iterable[object], mode: str) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text") -> None:
-    """Print a table; missing values are empty, in JSON null.
+    """Print a table; missing values are empty, or null in JSON.
 
     Args:
         columns: Names of the columns, in order.
         rows: A value for each column.
-        form: ``text``, with columns of numbers aligned to the right, ``csv``, or ``json``, a list of objects.
+        form: ``text``, with right-aligned numeric columns, ``csv``, or ``json``, a list of objects.
     """
     cells = [[None if value is None or value != value else value for value in row] for row in rows]
     if form == "json":

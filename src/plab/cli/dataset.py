@@ -1,4 +1,4 @@
-"""The command ``plab dataset``: demonstrations as datasets in Minari's format."""
+"""The command ``plab dataset``, which writes demonstrations as datasets in Minari's format."""
 
 from __future__ import annotations
 
@@ -73,13 +73,13 @@ def main(argv: Sequence[str]) -> None:
     parser = Parser("plab dataset", main.__doc__)
     add = parser.add_argument
     add("what", nargs="+", metavar="RESULTS | KEY=VALUE", help="keys are those of plab run -m")
-    add("--output", type=folder, help="folder of datasets: $MINARI_DATASETS_PATH, or datasets, by default")
-    add("--name", help="name of the dataset, plab/<Task>-v0 by default")
+    add("--output", type=folder, help="folder of datasets (default: $MINARI_DATASETS_PATH, or datasets)")
+    add("--name", help="name of the dataset (default: plab/<Task>-v0)")
     add("--observe", default="state", metavar="NAME,...", help="state (default), particles, depth, rgb, ...")
     what = "cameras by name: YAML with position, target, size, ..."
     add("--cameras", type=folder, metavar="FILE", help=what)
     add("--min-score", type=float, default=0.0, metavar="S", help="skip episodes with a lower score")
-    what = "scenes simulated at a time, 25 by default"
+    what = "scenes simulated at a time (default: 25)"
     add("--together", type=positive, default=25, metavar="N", help=what)
     add("--config-dir", metavar="FOLDER", help="folder with your own tasks, as for plab run")
     options = parser.parse_intermixed_args(argv)
@@ -150,7 +150,7 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
 
 
 def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
-    """Execute runs, and return their best actions, without failed runs."""
+    """Execute runs, and return the best actions of those that have not failed."""
     from plab.sweep.running import carry_here, run_batches
 
     for one in run_batches(cfgs, carry_here, together):
@@ -168,7 +168,7 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
     parsed = {one.key_or_group: one for one in parse(prepared(words))}
     rows = finished_rows(sources, [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED])
     changes = {key: one.value() for key, one in parsed.items() if key in REPLAYED}
-    # Without a gradient the memory budget has no effect, but must be equal.
+    # Without a gradient the memory budget has no effect, but must be equal in a batch.
     sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}
     sim |= {key[4:]: value for key, value in changes.items() if key.startswith("sim.")}
     own = {key: value for key, value in changes.items() if key in OBSERVATION_KEYS}
@@ -187,7 +187,7 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
 
 
 class _Recorder:
-    """Replay of demonstrations of one task in batches.
+    """Batched replay of one task's demonstrations.
 
     Attributes:
         spaces: Spaces of observations and actions, covering all scenes.
@@ -249,7 +249,7 @@ class _Recorder:
             )
 
     def env_spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """Return the environment of the first episode, for minari's ``recover_environment``."""
+        """Return the environment specification of the first episode, for minari's ``recover_environment``."""
         cfg = self._all[0].cfg
         words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
         words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]

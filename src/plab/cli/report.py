@@ -4,7 +4,7 @@ plab report tables results --out reports/tables
 plab report curves runs.plab.zip.xz task=Rope,Move seed=0,1,2
 plab report notebooks example
 plab report tables first second --split folder
-plab report html example                   real runs that come with plab
+plab report html example                   runs bundled with plab
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
     add("--bench", type=measurements, help=what)
     what = "html: render no pictures, which takes minutes; existing ones are kept"
     add("--no-pictures", dest="pictures", action="store_false", help=what)
-    what = "key whose values are treated as separate methods: method.lr, folder or seed"
+    what = "key whose values are treated as separate methods, such as method.lr, folder or seed"
     add("--split", default="", metavar="KEY", help=what)
     options = parser.parse_intermixed_args(argv)
     options.sources, options.words = sources_and_words(options.sources)

@@ -50,9 +50,9 @@ def main(argv: Sequence[str]) -> int | None:
 
 
 def _scores(argv: Sequence[str]) -> None:
-    """Print runs with their scores, a line each."""
+    """Print runs with their scores, one per line."""
     parser = Parser("plab results scores", _scores.__doc__)
-    add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default the finished ones")
+    add_sources(parser, "runs: task=Rope,Move seed=0,1,2 (default: finished runs)")
     what = "additional columns, comma-separated: keys such as method.lr, or columns of plab.results.load"
     parser.add_argument("--keys", type=_names, default=[], help=what)
     parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, separated by commas")
@@ -69,7 +69,7 @@ def _scores(argv: Sequence[str]) -> None:
 
 
 def _sql(argv: Sequence[str]) -> None:
-    """Answer an SQL query about the tables runs, config and iterations."""
+    """Run an SQL query on the tables runs, config and iterations."""
     parser = Parser("plab results sql", _sql.__doc__)
     parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
     add_sources(parser)
@@ -121,7 +121,7 @@ def _unpack(argv: Sequence[str]) -> None:
     parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
     options = parser.parse_intermixed_args(argv)
     written, kept = unpack(options.archive, options.output)
-    there = f", {kept} there already" if kept else ""
+    there = f", {kept} existed already" if kept else ""
     print(f"{options.output}: {written} run(s) written{there}")
 
 

@@ -57,7 +57,7 @@ def render(argv: Sequence[str]) -> None:
     path = resolve_rollout(options, ".png")
     require_writable(path)
     require_graphics()
-    # Imported here, as below, because it loads the simulator, which the checks above do not need.
+    # Imported here and below, because it loads the simulator, which the checks above do not need.
     from plab.render import pictures
     from plab.render.rollouts import record
 
@@ -74,7 +74,7 @@ def view(argv: Sequence[str]) -> None:
     plab view KEY=VALUE ... [--output FILE.html]
     plab view --gallery [KEY=VALUE ...] [--output FOLDER]     a page of every task, and index.html
 
-    It plays in any browser: plasticine, manipulators, and the translucent target. Space plays and pauses,
+    The page shows plasticine, manipulators and the translucent target in any browser. Space plays and pauses;
     arrow keys move by one step.
 
     EXAMPLES
@@ -82,7 +82,9 @@ def view(argv: Sequence[str]) -> None:
       plab view task=Torus variant=2 --output torus.html
     """
     parser = _parser("plab view", view.__doc__, "the page")
-    what = "by default a .html named like the result or the task; of --gallery a folder, gallery by default"
+    what = (
+        ".html file (default: named after the result or the task); with --gallery a folder (default: gallery)"
+    )
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
     parser.add_argument(
         "--gallery", action="store_true", help="frames of the best known actions of every task"
@@ -129,7 +131,7 @@ def export(argv: Sequence[str]) -> None:
     Content of the folder:
       vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
       ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
-    Both hold the target's surface, too.
+    Both include the target's surface.
 
     EXAMPLES
       plab export results/Rope-v1/adam/seed0-12ab34cd.h5
@@ -139,7 +141,7 @@ def export(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--format", choices=("vtk", "ply"), default="vtk", help="format of the files (default: vtk)"
     )
-    what = "by default named like the result or the task"
+    what = "folder (default: named after the result or the task)"
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
     options = parser.parse_intermixed_args(argv)
     output = resolve_rollout(options, f"-{options.format}")
@@ -170,9 +172,9 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
 
 
 def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
-    """Find the rollout, without simulating.
+    """Find the rollout without simulating.
 
-    Adds ``result``, the result file or None, and ``config``, the configuration if there is no result; and a
+    Sets ``result``, the result file or None, and ``config``, the configuration if there is no result; and a
     default ``output``: beside the result (but not inside an archive) with the suffix ``ending``, or named
     after the task.
 
@@ -180,10 +182,10 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         The output.
 
     Raises:
-        RenderError: If nothing is selected, or both a run and a task.
-        plab.config.ConfigError: If the configuration is wrong.
+        RenderError: If nothing is selected, or both a run and a task are.
+        plab.config.ConfigError: If the configuration is invalid.
     """
-    # Imported here, as below, because h5py and pandas are slow to load.
+    # Imported here and below, because h5py and pandas are slow to load.
     from plab.results.run_file import ARCHIVE_SUFFIX, split_archive
 
     sources, words = sources_and_words(options.what, default=None)
@@ -191,7 +193,9 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         options.result, name = _best(sources, words)
         usual = Path(f"{name}{ending}")
     elif len(sources) > 1 or (sources and words):
-        raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'")
+        raise RenderError(
+            f"name either one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'"
+        )
     elif sources:
         (options.result,) = sources
         place = Path() if split_archive(options.result) else options.result.parent
@@ -202,7 +206,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         check_sources(cfg)
         usual = Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
     else:
-        raise RenderError("nothing to show: give a result file, or a task such as task=Torus; see --help")
+        raise RenderError("nothing to show: name a result file, or a task such as task=Torus; see --help")
     options.output = options.output or usual
     return options.output
 
@@ -217,7 +221,7 @@ def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
 
 
 def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
-    """Return configuration and actions, shape [T, A], of the rollout that :func:`resolve_rollout` found."""
+    """Return configuration and actions, shape [T, A], of the rollout found by :func:`resolve_rollout`."""
     from plab.render import rollouts
 
     if options.result:

@@ -1,4 +1,4 @@
-"""The command ``plab run``: one configuration composed, checked and run, or a sweep; texts of its help."""
+"""The command ``plab run``, which executes one configuration or a sweep, and its help texts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     try:
         if (master := _sweep_settings(options, words)) is not None:
-            # Imported here, as below, because torch and Taichi take seconds to load.
+            # Imported here and below, because torch and Taichi take seconds to load.
             from plab.sweep.running import sweep
 
             return sweep(words, master, config_dir)
@@ -56,12 +56,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | None:
-    """Return a configuration with Hydra's settings for a sweep, or None for a single run."""
+    """Return a configuration with Hydra's sweep settings, or None for a single run."""
     by_key = [(one.key_or_group, one) for one in parse(words)]
     own = [one for key, one in by_key if key == EXPERIMENT or one.is_hydra_override()]
     if not own and not options.multirun:
         return None
-    # Folders for the logs of launchers; other keys may belong to another method or task than the default.
+    # Folders for launcher logs; other keys may belong to a method or task other than the default.
     own += [one for key, one in by_key if key == "results_dir" and not one.is_sweep_override()]
     master = compose_with_hydra([str(one.input_line) for one in own], options.config_dir)
     if options.multirun or str(master.hydra.mode).endswith("MULTIRUN"):
@@ -145,7 +145,7 @@ _WIDTH = 100
 
 
 def help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help``, two screens: usage, flags, names of all choices, including the user's
+    """Return the two-screen text of ``--help``: usage, flags, names of all choices, including the user's
     files in ``config_dir``, and frequent keys."""
     parts = [_USAGE, _FLAGS, "CHOICES"]
     for group in (*GROUPS, EXPERIMENT):
@@ -157,7 +157,7 @@ def help_text(config_dir: str | None = None) -> str:
 
 def full_help_text(config_dir: str | None = None) -> str:
     """Return the text of ``--help-all``: ``--help``, more examples, and the commented YAML file of each
-    choice, which has every key with its default."""
+    choice, with every key and its default."""
     head = "FILES; their keys are below the name of the group, such as method.lr"
     parts = [help_text(config_dir), _MORE_EXAMPLES, head]
     files = {"config": conf_folder() / "config.yaml"}

@@ -1,7 +1,7 @@
 """Show finished, running, failed and missing runs.
 
-Without arguments, the runs in results. Selections such as task=Rope seed=0,1 request all combinations of the
-given values, and show the missing ones; --missing requests the whole suite.
+Without arguments, show the runs in results. Selections such as task=Rope seed=0,1 request all combinations
+of the given values, and also show missing runs; --missing requests the whole suite.
 """
 
 from __future__ import annotations

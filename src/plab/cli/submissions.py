@@ -38,7 +38,7 @@ from plab.submissions.verifying import verify as simulate_again
 from plab.targets.build import PHYSICS_VERSION
 
 _PACKAGE = "plab.submissions"
-"""Folder of the page's templates."""
+"""Folder of the page templates."""
 
 
 @command_line
@@ -60,17 +60,17 @@ def submit(argv: Sequence[str]) -> None:
     add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
     add("--policy", type=_policy, action="append", default=[], help=what)
-    add("--steps", type=positive, help="with --policy: environment steps in the training of each policy")
+    add("--steps", type=positive, help="with --policy: environment steps used to train each policy")
     what = f"with --policy: evaluate in the {len(UNSEEN)} unseen configurations of the task, too"
     add("--unseen", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources, default=None)
     if bool(options.policy) == bool(sources):
-        parser.error("give either recordings or results, or --policy")
+        parser.error("use either recordings or results, or --policy")
     if bool(options.policy) != (options.steps is not None):
-        parser.error("--policy and --steps go together")
+        parser.error("--policy and --steps must be used together")
     if options.unseen and not options.policy:
-        parser.error("--unseen is for --policy")
+        parser.error("--unseen requires --policy")
     try:
         card = parse_card(options.card.read_bytes(), str(options.card))
     except OSError as error:
@@ -91,7 +91,7 @@ def submit(argv: Sequence[str]) -> None:
 
 
 def _policy(text: str) -> tuple[str, Path]:
-    """Read ``Move=move.pt``."""
+    """Parse ``Move=move.pt``."""
     task, _, name = text.partition("=")
     path = Path(name)
     if task not in suite_tasks() or path.suffix not in (".pt", ".onnx"):
@@ -106,19 +106,19 @@ def verify(argv: Sequence[str]) -> int:
     plab verify mine.plabsub.zip
     plab verify submissions --run-policies sim.device=cuda
 
-    Exit code: 0 if all claims hold, 1 if one does not or was not run, 2 if a file cannot be verified. The
-    outcome is stored beside each file, for plab leaderboard. Plans are data; policies are programs from
-    others, and executed only with --run-policies.
+    Exit code: 0 if all claims hold, 1 if a claim does not hold or was not run, 2 if a file cannot be
+    verified. The outcome is stored beside each file, for plab leaderboard. Plans are data; policies are
+    programs written by others, and executed only with --run-policies.
     """
     parser = Parser("plab verify", verify.__doc__)
     what = f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda"
     parser.add_argument("arguments", nargs="+", help=what)
-    what = "run the policies in the files; they are programs of others, so use a sandbox"
+    what = "run the policies in the files, which are programs written by others: use a sandbox"
     parser.add_argument("--run-policies", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.arguments, default=None)
     if not sources:
-        parser.error("name a submission, or a folder of them")
+        parser.error("name a submission file or a folder")
     if missing := [source for source in sources if not submission_files(source)]:
         raise SubmissionError(f"{missing[0]} has no submissions, files <name>{SUFFIX}")
     codes = []
@@ -153,12 +153,12 @@ def leaderboard(argv: Sequence[str]) -> None:
     plab leaderboard submissions
     plab leaderboard submissions --out public/leaderboard
 
-    Run plab verify on the folder first; its stored outcomes are shown. The page is index.html; it needs no
-    server.
+    Run plab verify on the folder first; the page shows its stored outcomes. The page is index.html, and needs
+    no server.
     """
     parser = Parser("plab leaderboard", leaderboard.__doc__)
     parser.add_argument("folder", type=folder, help="folder of submissions")
-    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
+    what = "settings of your own leaderboard, such as sim.grid_size=32"
     parser.add_argument("overrides", nargs="*", help=what)
     what = "folder to write to (default: reports/leaderboard)"
     parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)

@@ -23,18 +23,18 @@ from plab.targets import EPISODE_STEPS
 
 
 def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
-    """Add the shared arguments, and parse."""
+    """Add the shared arguments, and parse the command line."""
     add = parser.add_argument
-    add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
+    add("overrides", nargs="*", help="overrides of the configuration, such as sim.device=cuda")
     add("--task", type=task_list, default=suite_tasks(), help="only these tasks, such as Torus,Rope")
     options = parser.parse_intermixed_args(argv)
     if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks of --task are used: leave out '{taken[0]}'")
+        parser.error(f"all variants of the tasks in --task are used: omit '{taken[0]}'")
     return options
 
 
 def variants(task: str, overrides: Sequence[str]) -> list[Config]:
-    """Return the configurations of a task's variants; the first one is checked."""
+    """Return the configurations of a task's variants, after checking the first one."""
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
     check_sources(cfgs[0])
     return cfgs
@@ -45,7 +45,7 @@ def variants(task: str, overrides: Sequence[str]) -> list[Config]:
 
 @dataclass(frozen=True)
 class ReplayedDemonstration:
-    """Actions, shape [T, A], their scores in the hard contact model, and those without motion."""
+    """Actions, shape [T, A], their scores in the hard contact model, and the scores without motion."""
 
     cfg: Config
     actions: np.ndarray
@@ -71,7 +71,8 @@ def demonstrations(argv: Sequence[str]) -> None:
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
-    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None means no motion."""
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None stands for no
+    motion."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
@@ -104,18 +105,18 @@ def targets(argv: Sequence[str]) -> None:
 
     plab targets                       all fifty
     plab targets --task Torus,Rope     only these
-    plab targets --rebuild             simulate even what is cached
-    plab targets --csv moments.csv     write what is printed to a file, too
+    plab targets --rebuild             simulate cached targets, too
+    plab targets --csv moments.csv     also write the table to a file
 
-    Overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it describes the
-    targets of the original release.
+    Overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it
+    describes the targets of the original release.
     """
     parser = Parser("plab targets", targets.__doc__)
-    parser.add_argument("--rebuild", action="store_true", help="simulate also cached targets")
+    parser.add_argument("--rebuild", action="store_true", help="simulate cached targets, too")
     parser.add_argument("--csv", type=to_write, help="also write the table to this file")
     options = _options(parser, argv)
     if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
-        parser.error("--rebuild has no effect with targets.source: leave one of them out")
+        parser.error("--rebuild has no effect with targets.source: omit one of them")
     table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])
     print_table(list(table.columns), table.itertuples(index=False, name=None))
     print(f"simulated targets are cached in {cache_dir() / 'targets'}")
@@ -129,13 +130,13 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
 
     Args:
         task: Name of a task of the suite.
-        overrides: Of the configuration.
-        rebuild: Simulate also cached targets.
+        overrides: Overrides of the configuration.
+        rebuild: Whether to simulate cached targets, too.
 
     Returns:
         A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and
-        standard deviation along x, y, z [domain units], share of the mass that has to move from the start,
-        mean distance of the start's mass from the target [domain units], average build time [s].
+        standard deviation along x, y, z [domain units], fraction of the mass that has to move,
+        mean distance of the initial mass from the target [domain units], average build time [s].
     """
     cfgs = variants(task, overrides)
     for cfg in cfgs:

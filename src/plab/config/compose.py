@@ -1,4 +1,4 @@
-"""Composition of a run's configuration from files and overrides, its checks, and its scene.
+"""Composition of a run's configuration from files and overrides, validation, and the scene.
 
 ``conf/*.yaml`` has all default values; the dataclasses in this package define the keys. Hydra composes the
 files, optionally with a user's folder, and the overrides. :func:`finish` merges the chosen variant over the
@@ -61,7 +61,7 @@ TABLES = {
 
 
 def _by_task(table: str, default: Any = None, *, _parent_: DictConfig, _root_: DictConfig) -> Any:
-    """Return the entry of a method's table for the protocol and the task, or for ``other`` tasks."""
+    """Return the entry of a method's table for the protocol and the task, or for ``other``."""
     method = _parent_ if table in _parent_ else _root_.method
     row = method[table].get(_root_.protocol[TABLES[table]], default)
     return row.get(_root_.task.name, row.get("other", default)) if isinstance(row, DictConfig) else row
@@ -74,7 +74,7 @@ OmegaConf.register_new_resolver("by_task", _by_task, replace=True)
 
 
 def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the files of a group, such as ``task``, by name, sorted: plab's own and the user's."""
+    """Return the files of a group, such as ``task``, by name, sorted: plab's own files and the user's."""
     folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir)])]
     files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
     return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
@@ -88,8 +88,8 @@ def load_config(
     Args:
         overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
         config_dir: Folder with the user's files, in subfolders named like the groups.
-        alone: Whether overrides for another variant, task or profile are errors, because there is no other
-            run that uses them.
+        alone: Whether the configuration is for a single run, so that overrides for another variant, task or
+            profile are errors.
 
     Returns:
         The checked configuration.
@@ -158,15 +158,16 @@ def hydra_app() -> Hydra:
 
 
 def _sets_a_value(override: Override) -> bool:
-    """Return whether an override is ``key=value``: no sweep, choice of files, addition or removal."""
+    """Return whether an override has the form ``key=value``, and is no sweep, file selection, addition or
+    removal."""
     group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
     other = group or override.is_sweep_override() or override.is_hydra_override()
     return override.type is OverrideType.CHANGE and not other
 
 
 def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
-    """Raise ConfigError for selections of files that Hydra would misinterpret, and for a folder of the user's
-    files and modules, see :mod:`plab.plugins`, that cannot be used."""
+    """Raise ConfigError for file selections that Hydra would misinterpret, and for a folder of user files and
+    modules, see :mod:`plab.plugins`, that cannot be used."""
     if config_dir is not None:
         folder = Path(config_dir).expanduser()
         if not str(config_dir).strip() or not folder.is_dir():
@@ -174,7 +175,7 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
         for path in (path for group in (*GROUPS, EXPERIMENT) for path in (folder / group).glob("*.yaml")):
             # Hydra would ignore it.
             if path.stem in choices(path.parent.name):
-                raise ConfigError(f"{path}: plab has a {path.parent.name} of this name: rename the file")
+                raise ConfigError(f"{path}: plab has a {path.parent.name} with this name: rename the file")
         search_in(folder)
     for override in parse(words):
         key, text = override.key_or_group, str(override.input_line)
@@ -183,7 +184,7 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
         if override.is_add() != (key == EXPERIMENT):
             raise ConfigError(f"'{text}': write {'+' * (key == EXPERIMENT)}{text.lstrip('+')}")
         if not isinstance(override.value(), str) and (key == EXPERIMENT or not override.is_sweep_override()):
-            raise ConfigError(f"'{text}': name one {key}; choose from: {', '.join(choices(key, config_dir))}")
+            raise ConfigError(f"'{text}': choose one {key} from: {', '.join(choices(key, config_dir))}")
 
 
 def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = True) -> Config:
@@ -222,7 +223,7 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     """Return copies of a configuration with random scenes (``variant=random``), one per ``seed_scene``; raise
-    ConfigError if the task is not an unmodified task of the suite, or has no section ``random``."""
+    ConfigError if the task is not an unmodified task of the suite, or has no ``random`` section."""
     from plab.config.randomization import with_own_materials
 
     name, own = cfg.task.name, [f"variant={cfg.variant}"]
@@ -286,7 +287,7 @@ def check_sources(cfg: Config) -> None:
 
 
 def require_runnable(cfg: Config) -> None:
-    """Raise ConfigError unless the device and the optional packages of a run are available."""
+    """Raise ConfigError unless the device and the optional packages that a run needs are available."""
     # Imported here: Taichi takes a second.
     from plab.sim.runtime import cuda_devices
 
@@ -301,7 +302,7 @@ def require_runnable(cfg: Config) -> None:
 
 
 def _typed_method(method: DictConfig, path: str) -> DictConfig:
-    """Return a typed section ``method``."""
+    """Convert a ``method`` section to its type."""
     if not isinstance(method, DictConfig) or "family" not in method:
         raise ConfigError(f"{path}.family is missing: set it to the name of a family, or to module:NAME")
     if isinstance(stages := method.get("stages"), DictConfig):
@@ -350,7 +351,7 @@ def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: 
 def _refuse_undone(
     overrides: Sequence[Override], changes: DictConfig, choice: str, place: str = "task.random"
 ) -> None:
-    """Reject overrides of keys of the task that ``changes`` overwrite."""
+    """Reject overrides of task keys that ``changes`` overwrite."""
     for override in overrides:
         group, _, key = override.key_or_group.partition(".")
         if group == "task" and key and OmegaConf.select(changes, key) is not None:
@@ -358,7 +359,7 @@ def _refuse_undone(
 
 
 def _choose_profile(method: DictConfig) -> None:
-    """Resolve references to the chosen profile, and remove the profiles."""
+    """Resolve references to the selected profile, and remove the profiles."""
     if method.get("profile") is not None or method.get("profiles"):
         ranges.one_of("method.profile", str(method.profile), list(map(str, method.profiles)))
         _resolve(method, ["profiles"])
@@ -376,7 +377,7 @@ def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
 
 
 def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None:
-    """Merge the variant, sampled if random, into the task, and remove the others."""
+    """Merge the selected variant, sampled if random, into the task, and remove the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
         from plab.config.randomization import draw_variant
@@ -397,7 +398,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
 
 
 def _reject_unknown(node: Any, path: str) -> None:
-    """Reject keys that no dataclass defines; Hydra lets ``+key=value`` add them."""
+    """Reject keys that no dataclass defines, because Hydra lets ``+key=value`` add them."""
     if not isinstance(node, DictConfig) or node._is_missing() or node._is_none() or node._is_interpolation():
         return
     kind = OmegaConf.get_type(node)

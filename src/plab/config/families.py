@@ -1,6 +1,6 @@
-"""Families of methods: types of their records, and the registry.
+"""Families of methods: record types and the registry.
 
-A record is at the end of a runner's file, after the dataclass of the section ``method``. A method's YAML
+A record is at the end of a runner's file, after the dataclass of the ``method`` section. A method's YAML
 refers to it by ``family``: a name of :data:`FAMILIES`, or ``module:NAME`` outside plab; see
 docs/own_method.md. These files import large libraries only on use, so that looking up a record is fast.
 """
@@ -29,9 +29,9 @@ class Appearance:
     """Appearance of a method in tables and figures.
 
     Attributes:
-        label: Name for readers.
-        colour: Colour of its curves.
-        dashes: Line style, for readers who cannot distinguish colours.
+        label: Displayed name.
+        colour: Colour of the curves.
+        dashes: Line style, for readers who cannot distinguish the colours.
     """
 
     label: str
@@ -45,7 +45,7 @@ class Rule:
 
     Attributes:
         what: Implementation; its type depends on the family's runner.
-        config: Type of the section ``method``; None: the family's.
+        config: Type of the ``method`` section; None: the family's.
     """
 
     what: Any
@@ -58,15 +58,15 @@ class Family:
 
     Attributes:
         label: Short description of its methods.
-        config: Type of the section ``method``, a subclass of :class:`plab.config.MethodConfig`.
+        config: Type of the ``method`` section, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
         columns: Additional columns of the results.
-        may_be_nan: Columns that may have missing numbers.
+        may_be_nan: Columns that may contain NaN.
         ranking: Criterion for the best actions of a run: lowest ``loss``, or highest ``score``, with ties
             broken by loss.
         batching: Whether runs can share a simulator; otherwise they are executed one by one.
-        in_step: Whether runs of a batch must have the same section ``method``, as agents in lockstep.
+        in_step: Whether runs of a batch must have the same ``method`` section, as agents in lockstep do.
         rules: Choices of ``method.algorithm`` or ``method.optimizer``, if any.
         contact: Contact model of the rows, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
@@ -87,7 +87,7 @@ class Family:
     methods: Mapping[str, Appearance] = field(default_factory=dict)
 
     def config_type(self, rule: str | None = None) -> type:
-        """Return the type of the section ``method``, which may depend on the rule."""
+        """Return the type of the ``method`` section, which may depend on the rule."""
         own = self.rules.get(rule or "")
         return self.config if own is None or own.config is None else own.config
 
@@ -107,15 +107,15 @@ FAMILIES = Registry(
 
 
 def family(name: str) -> Family:
-    """Return the family of a key of :data:`FAMILIES`, or of the ``module:NAME`` of a record elsewhere; raise
-    ConfigError if there is none."""
+    """Return the family for a key of :data:`FAMILIES`, or for the ``module:NAME`` of a record elsewhere;
+    raise ConfigError if it does not exist."""
     found: Family = FAMILIES.find(name, "method.family")
     return found
 
 
 def known_family(name: str) -> Family | None:
-    """Return the family of a name, or None if its module has not been imported: reading results does not
-    require it, and result files must not determine imports."""
+    """Return the family with a name, or None if its module has not been imported. Reading results does not
+    require it, and result files must not trigger imports."""
     if name in FAMILIES or name.partition(":")[0] in sys.modules:
         try:
             return family(name)

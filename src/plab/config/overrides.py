@@ -24,14 +24,16 @@ FOLDERS = ("results_dir", "targets.source")
 """Keys with folder names as values."""
 
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
-"""Infinity and NaN in YAML's notation."""
+"""Infinity and NaN in YAML notation."""
 
 
 def prepared(words: Sequence[str]) -> list[str]:
     """Return overrides in the form that Hydra reads: names of folders and files quoted, ``.inf`` as ``inf``;
-    raise ConfigError for a text in place of a list."""
+    raise ConfigError for a string in place of a list."""
     if isinstance(words, str):
-        raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
+        raise ConfigError(
+            f"overrides must be a list of strings, such as ['task=Move', 'seed=3'], not {words!r}"
+        )
     return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in words]
 
 
@@ -39,21 +41,21 @@ def _quote_path(word: str) -> str:
     key, _, text = word.partition("=")
     own = key.lstrip("+")
     is_path = own in FOLDERS or (own.startswith("task.") and own.endswith(".file"))
-    # Quoted texts, null, interpolations, and several values of a sweep are unchanged.
+    # Quoted strings, null, interpolations, and multiple values of a sweep are unchanged.
     if not is_path or text == "null" or not text.strip() or re.search(r"[,'\"]|\$\{|^\w+\(", text):
         return word
     return f"{key}={quoted(text)}"
 
 
 def quoted(text: str) -> str:
-    """Return a quoted text that Hydra reads literally."""
+    """Return a quoted string that Hydra reads literally."""
     # Backslashes are literal, unless followed by a quote.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + (r"\'" if found[2] else ""), text)
     return f"'{escaped}'"
 
 
 def parse(words: Sequence[str]) -> list[Override]:
-    """Parse overrides; raise ConfigError if one cannot be read."""
+    """Parse overrides; raise ConfigError if one is invalid."""
     try:
         return [_parsed(word) for word in words]
     except HydraException as error:
@@ -68,7 +70,7 @@ def _parsed(word: str) -> Override:
 
 
 def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
-    """Return the values of an override, such as ``seed=0,1`` or ``task=glob(R*)``, as texts; globs select
+    """Return the values of an override, such as ``seed=0,1`` or ``task=glob(R*)``, as strings; globs select
     from ``names``. Raise ConfigError if there are no values."""
     value = override.value()
     if isinstance(value, IntervalSweep):
@@ -90,8 +92,8 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
 
 
 def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return the changes of a variant, given a task with all its variants; raise ConfigError if there is no
-    such variant."""
+    """Return the changes of a variant, given a task with all its variants; raise ConfigError if the variant
+    does not exist."""
     if name not in task.variants:
         names = [*task.variants, *([RANDOM] if task.random else [])]
         advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
@@ -106,7 +108,7 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
 # ---------------------------------------------------------------------------------------------- explanations
 
 COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
-"""Exceptions raised for a wrong configuration."""
+"""Exceptions raised for an invalid configuration."""
 
 
 def explain(error: Exception) -> str:

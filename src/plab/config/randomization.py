@@ -1,4 +1,4 @@
-"""Random parameters of a task: those of ``variant=random``, and those of every episode.
+"""Random task parameters of ``variant=random`` and of individual episodes.
 
 ``variant=random`` is sampled once, from the ranges in the task's section ``random``; samples depend only on
 the task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
@@ -38,7 +38,7 @@ _POSITIONS = {"bodies": "center", "manipulators": "position"}
 """Keys of the positions that ``offset`` shifts."""
 
 _FIXED = ("particles", "size", "center", "dt")
-"""Numbers of a body that cannot be randomised, or only by ``offset``."""
+"""Parameters of a body that cannot be randomised, or only by ``offset``."""
 
 Values = dict[str, Any]
 """Sampled numbers and lists of numbers by dotted key of the task."""
@@ -48,8 +48,8 @@ Values = dict[str, Any]
 
 
 def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the lowest and highest values of sampled parameters, by dotted key, sorted; raise ConfigError if
-    a range is invalid, or its key cannot be randomised."""
+    """Return the lowest and highest values of sampled parameters, sorted by dotted key; raise ConfigError if
+    a range is invalid or its key cannot be randomised."""
     found: dict[str, tuple[Any, Any]] = {}
     for key, bounds in leaves(task.randomize):
         path = f"task.randomize.{key}"
@@ -68,7 +68,7 @@ def ranges_of(task: TaskConfig) -> dict[str, tuple[Any, Any]]:
 
 def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
     """Return the value of a randomised key as a number or a list of numbers; raise ConfigError, with a
-    message that begins with ``path``, if the key cannot be randomised, or the value is invalid."""
+    message that begins with ``path``, if the key cannot be randomised or the value is invalid."""
     present = present_value(task, key, path)
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "iuf" or numbers.shape != np.shape(present):
@@ -106,7 +106,7 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
 
 
 def _entries(node: Any) -> dict[str, Any]:
-    """Return a mutable view of the values of a part of a task, by key."""
+    """Return a mutable view of the values in a part of a task, by key."""
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 
@@ -120,7 +120,7 @@ def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Val
 
 
 def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
-    """Return a configuration with some values replaced in the task, except ``yaw`` and noise."""
+    """Return a configuration with some task values replaced, except ``yaw`` and noise."""
     task = copy.deepcopy(cfg.task)
     for key, value in values.items():
         *parts, last = key.split(".")
@@ -136,7 +136,7 @@ def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
 
 
 def yaws(task: TaskConfig, values: Mapping[str, Any]) -> dict[str, float]:
-    """Return the rotation angles of turned bodies about vertical axes through their centres [rad]."""
+    """Return the rotation angles of rotated bodies about vertical axes through their centres [rad]."""
     return {name: float(yaw) for name in task.bodies if (yaw := values.get(f"bodies.{name}.yaw"))}
 
 
@@ -151,7 +151,7 @@ def with_own_materials(cfg: Config) -> Config:
 
 
 def extremes(cfg: Config) -> list[Config]:
-    """Return configurations with all lowest and with all highest values of sampled parameters."""
+    """Return two configurations, with the lowest and with the highest values of all sampled parameters."""
     bounds = ranges_of(cfg.task)
     return [with_values(cfg, {key: pair[side] for key, pair in bounds.items()}) for side in (0, 1)]
 
@@ -162,7 +162,7 @@ def without_draws(cfg: Config) -> Config:
 
 
 def turned(x: np.ndarray, center: np.ndarray, angle: float) -> np.ndarray:
-    """Return positions, shape [particle, 3], turned about the vertical axis through a centre [rad]."""
+    """Return positions, shape [particle, 3], rotated about the vertical axis through a centre [rad]."""
     sine, cosine = math.sin(angle), math.cos(angle)
     turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return center + (x - center) @ turn.T
@@ -179,13 +179,13 @@ DECIMALS = 4
 FIRST_TARGET_SEED = 1000
 """Lower bound of sampled seeds of scripted targets, above those of variants in YAML files."""
 
-# Additional entropy, one per purpose; 0 would have no effect.
+# Additional entropy for each purpose; 0 would have no effect.
 _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     """Sample the changes of a random variant, in the structure of the entries of ``variants``; raise
-    ConfigError if the task has no section ``random``, or none of :data:`ATTEMPTS` samples is valid."""
+    ConfigError if the task has no ``random`` section, or none of :data:`ATTEMPTS` samples is valid."""
     if not task.random:
         raise ConfigError(
             f"task {task.name} has no section 'random'; choose a variant from: {', '.join(task.variants)}"
@@ -226,7 +226,7 @@ def _target_seed(seed_scene: int) -> int:
 
 
 def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> DictConfig:
-    """Sample all ranges and the displacement once; return them in the task's structure."""
+    """Sample all ranges and the displacement once; return the values in the task's structure."""
     changes = OmegaConf.create({})
     for draw in (random.ranges or {}).values():
         values = _uniform(draw, rng)
@@ -253,7 +253,7 @@ def _uniform(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
 
 
 def _check(task: TaskConfig, random: RandomConfig) -> None:
-    """Raise the errors of a sampled task, without simulating it."""
+    """Raise the errors of a sampled task without simulating it."""
     task.check("task")
     # The suite's grid and material, because samples must not depend on the run's.
     scene = Scene(task.name, task.build_bodies(), **task.build_tools())
@@ -272,7 +272,7 @@ def _check(task: TaskConfig, random: RandomConfig) -> None:
 
 
 def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
-    """Raise if the bounding box of a sampled body of a target overlaps another one; they may touch."""
+    """Raise ConfigError if the bounding box of a sampled target body overlaps another one; they may touch."""
     for (first, a), (second, b) in itertools.combinations(bodies.items(), 2):
         distance = np.abs(np.subtract(a.center, b.center))
         overlap = np.all(distance < a.build(1).half_extent() + b.build(1).half_extent() - 1e-9)

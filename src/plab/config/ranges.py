@@ -1,4 +1,4 @@
-"""Checks of values: functions of the key, ``path``, for the message, and the value."""
+"""Checks of configuration values, as functions of the key, ``path``, for the message, and the value."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from plab.errors import ConfigError, pick
 def folder_name(path: str, value: str) -> None:
     """Raise :class:`ConfigError` unless a name is valid as a folder name."""
     if not value.replace("_", "").replace("-", "").isalnum():
-        raise ConfigError(f"{path} '{value}' must be letters, digits, - and _: it names a folder")
+        raise ConfigError(f"{path} '{value}' names a folder: use only letters, digits, - and _")
 
 
 def one_of(path: str, value: str, names: Sequence[str]) -> None:
-    """Raise :class:`ConfigError` unless a value is one of some names."""
+    """Raise :class:`ConfigError` unless a value is one of the given names."""
     if value not in names:
         raise ConfigError(f"{path} '{value}' does not exist; {pick(value, names)}")
 
@@ -30,20 +30,20 @@ def positive(path: str, value: float) -> None:
 
 
 def at_least(path: str, value: float, low: float, *, finite: bool = False) -> None:
-    """Raise :class:`ConfigError` if a value is below ``low``, or not finite as required."""
+    """Raise :class:`ConfigError` if a value is below ``low``, or not finite where required."""
     if not value >= low or (finite and value == math.inf):
         limit = f"{low:g}{' and finite' if finite else ''}"
         raise ConfigError(f"{path} must be at least {limit}, not {value:g}")
 
 
 def vector(path: str, value: Sequence[float], length: int) -> None:
-    """Raise :class:`ConfigError` unless there are ``length`` finite numbers."""
+    """Raise :class:`ConfigError` unless a value consists of ``length`` finite numbers."""
     if len(value) != length or not all(math.isfinite(entry) for entry in value):
         raise ConfigError(f"{path} must be {length} finite numbers, not {list(value)}")
 
 
 def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str, Any]:
-    """Return metadata for a field of a :class:`Section`, to be checked by a function of this module."""
+    """Return metadata for a :class:`Section` field that is checked by a function of this module."""
     return {"check": lambda path, value: check(path, value, *limits, **options)}
 
 
@@ -69,8 +69,10 @@ THREADS = COUNT
 
 
 class Section:
-    """A section of the configuration; the metadata of its fields define the valid values besides None.
-    Sections in it are checked, too."""
+    """Section of the configuration; the metadata of its fields define the valid values besides None.
+
+    Nested sections are checked, too.
+    """
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""

@@ -1,4 +1,4 @@
-"""Types of a whole configuration and of its sections ``method``, ``sim``, ``protocol`` and ``targets``."""
+"""Types of a complete configuration and of its sections ``method``, ``sim``, ``protocol`` and ``targets``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plab.scenes import CONTACTS, CONVENTIONS, DEVICES, MATERIAL_KEYS, PRECISION
 LOGGERS = ("none", "tensorboard", "wandb")
 
 SCORES = ("best", "last")
-"""Iteration that gives the score of a run: ``protocol.score``."""
+"""Choices of ``protocol.score``, the iteration whose score is the run's score."""
 
 
 @dataclass
@@ -33,8 +33,8 @@ class MethodConfig(ranges.Section):
         family: Family: a key of ``plab.config.families.FAMILIES``, or the ``module:NAME`` of a
             :class:`plab.config.families.Family` outside plab.
         contact: Contact model of the rollouts, ``soft`` or ``hard``; the final evaluation always uses the
-            hard one.
-        softness: Decay rate alpha of the soft contact [1 / domain unit].
+            hard model.
+        softness: Decay rate alpha of the soft contact model [1 / domain unit].
         loss_weights: Weights of the loss terms by name; terms of weight 0 are left out.
         loss_terms: Implementation of a loss term: a key of ``plab.losses.TERMS``, or ``module:Class`` of a
             custom class.
@@ -99,9 +99,9 @@ class ProtocolConfig(ranges.Section):
     Attributes:
         name: Name of the protocol in results and reports; runs of different protocols are never averaged.
         start: Generator of the particles' initial positions, ``plab`` or ``release``.
-        numbers: Source of the task's numbers, likewise; the release's are in ``task.release``.
-        floor: Stencil of particles at the lower faces, likewise.
-        score: Iteration that gives a run's score, ``best`` or ``last``; affects the interpretation of a
+        numbers: Source of the task's numbers, ``plab`` or ``release``; the release's are in ``task.release``.
+        floor: Stencil of particles at the lower faces, ``plab`` or ``release``.
+        score: Iteration whose score is the run's, ``best`` or ``last``; affects the interpretation of a
             result, not its content. See :attr:`plab.results.RunResult.score`.
         contact: Default of ``method.loss_terms.contact``.
     """
@@ -132,7 +132,7 @@ class TargetsConfig:
 
 @dataclass
 class Config(ranges.Section):
-    """A run: one task and variant, one method, one seed.
+    """Configuration of a run: one task and variant, one method, one seed.
 
     Attributes:
         task: Scene, target and variants.
@@ -141,15 +141,16 @@ class Config(ranges.Section):
         sim: Discretisation, precision and device.
         targets: Source of the targets.
         variant: Name of the task's variant, such as ``1``, or ``random7`` for a random variant.
-        seed_scene: Seed of a random variant; None of other variants.
+        seed_scene: Seed of a random variant; None for other variants.
         seed_particles: Seed of the particles' initial positions. Simulated targets use 0.
-        observe_particles: Least number of particles in an observation: every (particle count // this)-th.
+        observe_particles: Minimum number of particles in an observation, which contains every
+            (particle count // this)-th.
         observe_target: Whether observations include :func:`plab.objective.target_observation`, for policies
-            for several targets.
+            that are trained on several targets.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
-        force: Recompute an existing result.
-        progress: Show a progress bar, and hints at the end.
+        force: Whether to recompute an existing result.
+        progress: Whether to show a progress bar, and hints at the end.
         logger: Additional logger of rows: ``none``, ``tensorboard`` or ``wandb``.
         checkpoint_seconds: Interval between checkpoints [s].
     """
@@ -185,12 +186,12 @@ class Config(ranges.Section):
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         if not self.results_dir.strip():
-            raise ConfigError("results_dir is empty: give a folder, such as results")
+            raise ConfigError("results_dir is empty: set it to a folder, such as results")
         if self.targets.source is not None and self.seed_scene is not None:
-            raise ConfigError("targets.source has no files for variant=random: leave one of them out")
+            raise ConfigError("targets.source has no files for variant=random: omit one of them")
 
     def method_as(self, kind: type[Method]) -> Method:
-        """Return the section ``method``; TypeError unless it is of a runner's type."""
+        """Return the ``method`` section; raise TypeError unless it has a runner's type."""
         if not isinstance(self.method, kind):
             name, own = self.method.name, type(self.method).__name__
             raise TypeError(f"method {name} has a {own}, not a {kind.__name__}")
@@ -200,7 +201,7 @@ class Config(ranges.Section):
 # --------------------------------------------------------------------------------------------------- identity
 
 SUFFIX = ".h5"
-"""End of the names of result files."""
+"""Suffix of result files."""
 
 RUN_ONLY_KEYS = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
 """Keys used only by ``plab run``."""
@@ -209,17 +210,17 @@ _NO_EFFECT = {
     "": RUN_ONLY_KEYS,
     # Gradients are bitwise independent of the spacing of checkpoints.
     "sim": ("memory_mb",),
-    # Name and score do not affect numbers, and the contact term is set by the method.
+    # Name and score do not affect the numbers, and the method determines the contact term.
     "protocol": ("name", "score", "contact"),
     "task": ("release", "cameras", "stages"),
 }
-"""Configuration keys by section that cannot affect a result and are left out of the hash."""
+"""Configuration keys by section that cannot affect a result and are excluded from the hash."""
 
 
 def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
     """Return a :class:`Config`, or a mapping, as plain dictionaries and lists.
 
-    Optional keys of bodies without a value, such as ``file``, are left out, as are unused ``kinematics``,
+    Optional keys of bodies without a value, such as ``file``, are omitted, as are unused ``kinematics``,
     ``randomize``, ``cameras`` and ``stages`` of a task.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
@@ -250,7 +251,7 @@ def config_hash(cfg: Config | Mapping[str, Any]) -> str:
 
 
 def _drop_places(node: Any) -> None:
-    """Remove file paths from a part of a configuration, because files are identified by their SHA-256."""
+    """Remove file paths from part of a configuration, because files are identified by their SHA-256."""
     for key, value in list(node.items()) if isinstance(node, dict) else ():
         if key in ("file", "model") and not isinstance(value, dict):
             del node[key]

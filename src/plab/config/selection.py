@@ -1,4 +1,5 @@
-"""Selection of runs by overrides as in a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
+"""Selection of runs by overrides in the form of a sweep, such as ``task=Rope,Move method=adam
+seed=0,1,2``."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ class Selection:
     """A choice of runs.
 
     Attributes:
-        choices: Allowed values, as text, by name: ``task``, ``variant``, ``method``, ``seed`` and the like.
-        keys: Values that configuration keys must have, by dotted key: ``{"task.yield_stress": ["50.0"]}``.
+        choices: Allowed values as strings by name: ``task``, ``variant``, ``method``, ``seed`` etc.
+        keys: Required values by dotted configuration key: ``{"task.yield_stress": ["50.0"]}``.
     """
 
     choices: dict[str, list[str]] = field(default_factory=dict)
@@ -35,8 +36,8 @@ class Selection:
 
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
-    """Parse selections of a command line, such as ``seed=0,1`` or ``seed=range(3)``, by ``names`` and dotted
-    keys of the configuration; raise ArgumentError or ConfigError if one is invalid."""
+    """Parse selections from a command line, such as ``seed=0,1`` or ``seed=range(3)``, by ``names`` and
+    dotted keys of the configuration; raise ArgumentError or ConfigError if one is invalid."""
     if not words:
         return Selection()
     # Imported here, because Hydra is slow to import and not needed without overrides.
@@ -56,8 +57,8 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the name of the common protocol of some runs, plab's own for none; raise ArgumentError if there
-    are several, which must not be averaged."""
+    """Return the name of the protocol shared by some runs, or plab's own if there are none; raise
+    ArgumentError if there are several, because their results must not be averaged."""
     names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
     if len(names) > 1:
         advice = f"choose one, for example protocol.name={names[0]}"
@@ -66,7 +67,7 @@ def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """Return a configuration's value of a dotted key, or NaN."""
+    """Return a configuration's value for a dotted key, or NaN."""
     value: Any = config
     for part in key.split("."):
         value = value.get(part, math.nan) if isinstance(value, Mapping) else math.nan
@@ -74,7 +75,8 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 def leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted keys of a configuration, below a key, with their values; empty sections are values."""
+    """Yield the dotted keys of a configuration below a key, with their values; empty sections count as
+    values."""
     if not isinstance(node, Mapping) or not node:
         yield key, node
         return
@@ -83,7 +85,7 @@ def leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _same(value: Any, text: str) -> bool:
-    """Return whether a configuration's value equals a text: numbers by value, others literally."""
+    """Return whether a configuration's value equals a string: numbers by value, others literally."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower() == text.lower()
     try:

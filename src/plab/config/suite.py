@@ -1,4 +1,4 @@
-"""Tasks and variants of the suite, found without importing Hydra, torch or Taichi."""
+"""Tasks and variants of the suite, located without importing Hydra, torch or Taichi."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ EXTENSION_TASKS = (
     *("Gripper", "HandFold", "HandLift", "HandPinch", "HandPress", "HandRoll"),
     *("Pour", "SandHeap"),
 )
-"""Extension tasks: articulated models, sand and fluid; not included in tables and defaults of the suite."""
+"""Extension tasks (articulated models, sand and fluid), excluded from the tables and defaults of the
+suite."""
 
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
-"""Methods that the paper compares, in its order."""
+"""Methods compared in the paper, in its order."""
 
 PAPER_SEEDS = ("0", "1", "2")
-"""Seeds of the paper for each configuration."""
+"""Seeds per configuration in the paper."""
 
 
 def conf_folder() -> Path:
@@ -38,18 +39,19 @@ def conf_folder() -> Path:
         if (folder / "config.yaml").is_file():
             return folder
     raise ConfigError(
-        f"no conf/config.yaml next to {package}: the installation is incomplete, install plab again"
+        f"no conf/config.yaml next to {package}: the installation is incomplete; install plab again"
     )
 
 
 def group_names(group: str) -> list[str]:
-    """Return the names of plab's own files of a group, such as ``method``; empty for unknown groups."""
+    """Return the names of plab's own files in a group, such as ``method``; empty for unknown groups."""
     return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
 
 
 @functools.cache
 def shipped_file(group: str, name: str) -> Mapping[str, Any]:
-    """Return the content of one of plab's own files merged over its bases; empty if it does not exist."""
+    """Return the content of one of plab's own files merged over its bases, or nothing if it does not
+    exist."""
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}

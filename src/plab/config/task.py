@@ -1,4 +1,4 @@
-"""Types of the section ``task``: bodies, manipulators, material, target, variants."""
+"""Types of the ``task`` section: bodies, manipulators, material, target and variants."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class BodyConfig(ranges.Section):
-    """A body of plasticine.
+    """A plasticine body.
 
     Attributes:
         shape: ``sphere``, ``box`` or ``mesh``.
@@ -43,7 +43,7 @@ class BodyConfig(ranges.Section):
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
         law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or the ``module:NAME`` of a custom law;
-            ``von_mises`` where it is not given.
+            default: ``von_mises``.
         parameters: Other parameters of the law, by name; default: the law's.
     """
 
@@ -60,7 +60,7 @@ class BodyConfig(ranges.Section):
     parameters: dict[str, float] = field(default_factory=dict)
 
     def build(self, particles_scale: float = 1.0) -> Body:
-        """Return the scene's body, with the number of particles scaled, at least one; errors are those of
+        """Return the scene's body, with its number of particles scaled (at least one); errors are those of
         :func:`plab.scenes.make_body`."""
         particles = max(1, round(self.particles * particles_scale))
         material = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law", "parameters")}
@@ -80,7 +80,7 @@ class ManipulatorConfig(ranges.Section):
         friction: Coulomb friction with the plasticine.
         lower_bound: Lowest position (x, y, z) [domain units].
         upper_bound: Highest position (x, y, z) [domain units].
-        gap: Chopsticks only: distance of the two axes at the start [domain units].
+        gap: Chopsticks only: distance between the two axes at the start [domain units].
         minimal_gap: Chopsticks only: smallest gap [domain units].
     """
 
@@ -121,7 +121,7 @@ class KinematicsConfig(ranges.Section):
     must match whole names; the last match applies.
 
     Attributes:
-        model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
+        model: MJCF or URDF file, or ``package:path`` of a file in an installed package.
         root: Body whose frame is placed in the domain; default: the model's world frame.
         size: Domain units per unit of length of the model.
         position: Position (x, y, z) of the origin of that frame [domain units].
@@ -130,10 +130,10 @@ class KinematicsConfig(ranges.Section):
         free: Whether the base moves, by the joints ``base_x``, ``base_y``, ``base_z``, ``base_yaw``,
             ``base_pitch`` and ``base_roll``.
         scale: Motion per environment step at action 1, by patterns of joints [rad or domain units]; joints
-            without one are fixed.
+            without a scale are fixed.
         start: Initial positions, by patterns of joints; default: 0, or the nearest limit.
         limits: Lowest and highest positions, by patterns of joints; default: the model's.
-        together: Patterns of joints driven by one action component, by its name.
+        together: Patterns of joints that share one action component, by the component's name.
         omit: Patterns of collision geometry to leave out.
         friction: Coulomb friction of all links with the plasticine.
         sha256: SHA-256 of the tree. Default: computed; another checksum is rejected.
@@ -169,8 +169,8 @@ class KinematicsConfig(ranges.Section):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
     def build(self) -> Chain:
-        """Return the scene's articulated model; raise ConfigError if it cannot be read or has changed, or a
-        pattern matches nothing."""
+        """Return the scene's articulated model; raise ConfigError if the model cannot be read or has changed,
+        or a pattern matches nothing."""
         patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
         with located("task.kinematics"):
             chain = self._read().placed(self.position, self.rotation, self.free, **patterns)
@@ -204,7 +204,7 @@ class RangeConfig(ranges.Section):
 
     Attributes:
         low: Lower bounds.
-        high: Upper bounds, as many.
+        high: Upper bounds, equal in number.
     """
 
     low: list[float]
@@ -236,10 +236,10 @@ class RandomConfig(ranges.Section):
     Attributes:
         variant: Variant with the values that are not sampled; default: the task itself.
         shift: Common displacement (x, y, z) of all bodies and moving manipulators, except those with their
-            own range [domain units]. default: none.
+            own range [domain units]; default: none.
         reach: Largest distance along an axis between a body and the target's body of the same name; samples
             beyond it are rejected [domain units]. None sets no limit.
-        ranges: Further sampled lists, by name.
+        ranges: Additional sampled lists, by name.
     """
 
     variant: str | None = None
@@ -263,18 +263,17 @@ class TaskConfig(ranges.Section):
         youngs_modulus: Young's modulus E; the density is 1.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
-        floor_friction: Friction of the floor: 0 slips, 10 and more sticks.
+        floor_friction: Friction of the floor: 0 slips, 10 or more sticks.
         gravity: Acceleration (x, y, z).
-        bodies: Bodies of plasticine, by name.
+        bodies: Plasticine bodies, by name.
         manipulators: Manipulators, by name, in the order of the action vector.
-        kinematics: An articulated model; its links and actions follow those of the manipulators; None
-            without.
+        kinematics: An articulated model, whose links and actions follow those of the manipulators; or None.
         target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
         variants: Overrides of the task by variant, in the structure of the task.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
         randomize: Ranges of parameters sampled in every episode, see :mod:`plab.config.randomization`;
-            empty: no randomisation.
+            default: no randomisation.
         cameras: Cameras of observations by name, each with the attributes of :class:`plab.scenes.Camera`.
         stages: Targets, like ``target``, that environments present in sequence before ``target``; runs use
             only ``target``.
@@ -321,7 +320,7 @@ class TaskConfig(ranges.Section):
 
     def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
         """Return the scene's bodies, see :meth:`BodyConfig.build`; ConfigError names the key of an invalid
-        one."""
+        body."""
         bodies = []
         for name, body in self.bodies.items():
             with located(f"task.bodies.{name}"):

@@ -22,8 +22,8 @@ ENTRY_POINT = "plab.envs.single:PlabEnv"
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """Create an environment of the suite, such as ``make("Rope")``.
 
-    Other arguments are those of :class:`plab.envs.single.PlabEnv` and of ``gymnasium.make``, which raises
-    ``gymnasium.error.Error`` if there is no such task or variant.
+    Other arguments are those of :class:`plab.envs.single.PlabEnv` and ``gymnasium.make``, which raises
+    ``gymnasium.error.Error`` if the task or the variant does not exist.
     """
     return gymnasium.make(f"plab/{task}-v{variant}", **kwargs)
 
@@ -39,7 +39,7 @@ def make_vec(
 
 
 def register_suite() -> None:
-    """Register all tasks of the suite and of its extension with Gymnasium."""
+    """Register all tasks of the suite and its extension with Gymnasium."""
     for task in (*suite_tasks(), *EXTENSION_TASKS):
         register_task(task)
 
@@ -48,8 +48,8 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
     """Register ``plab/<task>-v<variant>`` with Gymnasium.
 
     Args:
-        task: Name of the task, a file of ``task/`` in plab's own folder or in ``config_dir``.
-        variants: Numbers of its variants.
+        task: Name of the task, a file in ``task/`` of plab's own folder or ``config_dir``.
+        variants: Numbers of the variants.
         **kwargs: Fixed arguments of :class:`plab.envs.single.PlabEnv`, such as ``config_dir``.
     """
     for variant in variants:

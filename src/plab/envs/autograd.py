@@ -1,5 +1,5 @@
-"""Differentiable PyTorch functions of the simulator: trajectory losses of actions, states for custom losses,
-also with respect to initial state and material, and closed-loop policy gradients.
+"""Differentiable PyTorch functions of the simulator: trajectory losses of actions; states for custom losses,
+also with respect to initial state and material; and closed-loop policy gradients.
 
 With ``sim.device=cuda`` tensors stay on the device.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
-    """Simulate actions from the initial states and return the trajectory losses, differentiable with respect
+    """Simulate actions from the initial states, and return the trajectory losses, differentiable with respect
     to the actions.
 
     The contact model is that of the problem's simulator. The gradient is for a sequence of independent
@@ -109,12 +109,12 @@ def simulate(
             gradients.
         actions: Actions, shape [batch, T, A], on any device; integers become floating-point numbers of the
             simulator's precision.
-        every_step: Return the state after every environment step instead of only the last one.
-        mass: Return mass tensors, too.
+        every_step: Whether to return the state after every environment step instead of only the last one.
+        mass: Whether to return mass tensors, too.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] if
             bodies have their own materials; default: unchanged.
-        **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. They are stored in
-            the simulator, as is the material.
+        **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. Like the material,
+            they are stored in the simulator.
 
     Returns:
         The states, like ``actions`` in type and device.
@@ -220,11 +220,11 @@ def policy_gradient(
     samples (``rsample``).
 
     Args:
-        batch: Episodes that were :meth:`~plab.envs.core.EpisodeBatch.reset`; they advance.
+        batch: Episodes after :meth:`~plab.envs.core.EpisodeBatch.reset`; they advance by the steps.
         policy: Function from observations, shape [batch, entry], to actions, shape [batch, A], clipped to
             [-1, 1]; on the simulator's device. Observations have the type of its parameters.
         steps: Steps T.
-        parameters: Parameters of the policy; default: those of a module.
+        parameters: Parameters of the policy; default: the parameters of the module.
         discount: Discount factor: the loss of step t is weighted by ``discount ** t``, the value by
             ``discount ** T``.
         value: Function from observations to values, shape [batch]; its parameters receive no gradient.

@@ -1,4 +1,4 @@
-"""Batch of episodes in one simulator, the common base of all environments.
+"""Batch of episodes in one simulator, the common basis of all environments.
 
 The environments for Gymnasium, Stable-Baselines3 and PyTorch are thin adapters of an :class:`EpisodeBatch` to
 the interface of each library.
@@ -39,7 +39,7 @@ Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor if the caller passed one."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
-"""Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
+"""Gymnasium's metadata of every environment; at 20 frames per second an episode takes 2.5 s."""
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
@@ -48,7 +48,7 @@ _LOCK = threading.RLock()
 
 
 def _alone(method: _Method) -> _Method:
-    """Serialise calls of a method from several threads."""
+    """Serialise calls of a method from multiple threads."""
 
     @functools.wraps(method)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -67,7 +67,7 @@ def make_batch(task: str, variant: str, **options: Any) -> EpisodeBatch:
 
     Args:
         task: Name of the task.
-        variant: Name of its variant.
+        variant: Name of the variant.
         **options: Other arguments of :func:`compose_configs`, and keyword arguments of :class:`EpisodeBatch`.
 
     Errors are those of :func:`compose_configs` and :class:`EpisodeBatch`.
@@ -90,12 +90,12 @@ def compose_configs(
 
     Args:
         task: Name of the task.
-        variant: Name of its variant.
+        variant: Name of the variant.
         num_envs: Number of sub-environments.
         overrides: Overrides for all of them, as on the command line: ``["sim.device=cuda"]``.
-        overrides_per_env: Further overrides, one list per sub-environment, such as ``[["variant=1"],
-            ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
-        config_dir: Folder with YAML files of the user's own.
+        overrides_per_env: Additional overrides, one list per sub-environment, such as ``[["variant=1"],
+            ["variant=random", "seed_scene=5"]]``, except for ``sim`` and ``method``.
+        config_dir: Folder with the user's YAML files.
 
     Raises:
         ValueError: If numbers do not match, or overrides are not lists or set the task.
@@ -109,7 +109,7 @@ def compose_configs(
     for entries in (overrides, *own):
         if own_task := [word for word in prepared(entries) if word.partition("=")[0] == "task"]:
             raise ArgumentError(
-                f"'{own_task[0]}' has no effect on an environment of task {task}: create one of that task"
+                f"'{own_task[0]}' has no effect on an environment of task {task}: create another environment"
             )
     lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
@@ -117,7 +117,7 @@ def compose_configs(
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """Return a render mode; raise ValueError if there is none of this name."""
+    """Return a valid render mode, or raise ValueError."""
     if render_mode not in (None, *METADATA["render_modes"]):
         raise ArgumentError(f"render_mode '{render_mode}' must be rgb_array or None")
     return render_mode
@@ -137,7 +137,7 @@ class Transition:
         truncated: Whether episodes have reached the horizon, shape [batch], on the host.
         info: Entries of ``info``, each of shape [batch] and of the type of the rewards; sampled parameters
             are under ``randomized``, by key, on the host.
-        failures: Environments that have diverged in the episode, with time and reason; their values are those
+        failures: Environments that have diverged in the episode, with time and reason; they keep the values
             of the previous step. Empty if the step was ``strict``.
     """
 
@@ -217,12 +217,12 @@ class EpisodeBatch:
         render_size: tuple[int, int] = (480, 360),
         render_target: bool = False,
     ) -> None:
-        """Build everything; the episodes start at :meth:`reset`.
+        """Build scenes, targets and simulator; the episodes start at :meth:`reset`.
 
         Args:
-            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
+            cfgs: One configuration per sub-environment, with equal ``sim`` and loss.
             contact: Contact model, ``hard`` or ``soft``.
-            observe: One of :data:`plab.envs.observations.OBSERVATIONS`; or several, for dictionaries with
+            observe: One of :data:`plab.envs.observations.OBSERVATIONS`, or several for dictionaries with
                 keys such as ``state`` and ``front_depth``.
             cameras: Cameras by name, or their attributes; default: the task's, or one named ``front``.
             randomize: Ranges of randomised parameters, replacing those of the tasks, see
@@ -231,7 +231,7 @@ class EpisodeBatch:
             earth_movers: Whether ``info`` contains the earth mover's distances of episodes at their ends, see
                 :func:`plab.objective.earth_movers_distances`.
             stages: Whether episodes begin with the targets of ``task.stages``; set by :func:`make_batch`.
-            success_score: Least score of a success.
+            success_score: Minimum score of a success.
             terminate_on_success: Whether a success ends the episode.
             render_size: Width and height of pictures [pixels].
             render_target: Whether pictures show the target as a translucent shape.
@@ -267,7 +267,7 @@ class EpisodeBatch:
         """Replace the sub-environments by others of the same kind, without recompilation; the episodes start
         at :meth:`reset`.
 
-        ``cfgs`` and errors are those of the constructor; there must be as many sub-environments as before.
+        ``cfgs`` and errors are as in the constructor; the number of sub-environments must not change.
         """
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
@@ -304,7 +304,7 @@ class EpisodeBatch:
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
-        """Observe the initial states; no episode has started."""
+        """Observe the initial states before any episode has started."""
         self.changed_by_hand = False
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
@@ -339,7 +339,7 @@ class EpisodeBatch:
 
     @property
     def over(self) -> np.ndarray:
-        """Mask of the ended episodes, which need a reset, shape [batch]."""
+        """Mask of the ended episodes, which must be reset, shape [batch]."""
         over = self._over.copy()
         over[list(self.failures)] = True
         return over
@@ -363,23 +363,23 @@ class EpisodeBatch:
         episode: int | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the next episodes of all sub-environments, or of some.
+        """Start the next episodes of all or some sub-environments.
 
         Args:
             like: If a CUDA tensor, results are CUDA tensors.
             environments: Numbers of the sub-environments to reset; default: all.
             seeds: Seeds of these environments, which restart their random sequences; default: continue.
-            episode: Number of the episodes, which determines the samples; default: the next.
-            options: Values by dotted key of the task that replace samples, for all of these or, with a first
-                axis of the batch's length, one for each.
+            episode: Episode number, which determines the samples; default: the next.
+            options: Values by dotted key of the task that replace samples, for all of these sub-environments
+                or, with a first axis of the batch's length, one for each.
 
         Returns:
-            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch]. Other
-            sub-environments keep those of their last step.
+            Observations, shape [batch, entry], float32, or by key; and ``info``, entries of shape [batch].
+            Other sub-environments keep the values of their last step.
 
         Raises:
             ValueError: If an option is invalid.
-            RuntimeError: If the environment is closed or its simulator is invalid; also in the other methods.
+            RuntimeError: If the environment is closed or its simulator is invalid, as in all other methods.
         """
         if self._simulator.changes != self._changes:
             # The caller has changed scenes, targets or initial states.
@@ -416,7 +416,7 @@ class EpisodeBatch:
         return self._shown()
 
     def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
-        """Use the current states as initial states for scores and rewards."""
+        """Record the current states as initial states for scores and rewards."""
         self._changes = self._simulator.changes
         self._close_renderers()
         self._sensors.refresh()
@@ -427,7 +427,8 @@ class EpisodeBatch:
         self._new_observer()
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
-        """Store observations and measures, arrays or CUDA tensors; some environments keep their last ones."""
+        """Store observations and measures, arrays or CUDA tensors; some environments keep their previous
+        ones."""
 
         def restore(table: Array, old: Array) -> None:
             own = old[kept]
@@ -438,7 +439,7 @@ class EpisodeBatch:
             mapped(restore, table, old)
 
     def require_running(self, idle: np.ndarray | bool = False) -> None:
-        """Raise ResetNeeded if an episode has ended, also by divergence, except ``idle`` ones."""
+        """Raise ResetNeeded if an episode has ended or diverged, except ``idle`` ones."""
         if np.any(self.over & ~np.asarray(idle)):
             raise ResetNeeded("the episode is over: call reset() before step()")
 
@@ -491,7 +492,7 @@ class EpisodeBatch:
         return done
 
     def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
-        """Advance environments that have reached their stage's target to the next stage; return the
+        """Advance environments that have reached the target of their stage to the next stage; return the
         rewards."""
         reward = reward + Constants(stages.earned.copy()).like(like)
         stages.note(_on_host(info["score"]))
@@ -518,7 +519,7 @@ class EpisodeBatch:
 
     @_alone
     def get_state(self) -> EpisodeState:
-        """Return a copy of the state for :meth:`set_state`; on the CPU the continuation is bitwise
+        """Return a copy of the state for :meth:`set_state`; on the CPU, continuing from it is bitwise
         reproducible."""
         simulation = self._simulator.state()
         for e in self.failures:
@@ -531,8 +532,8 @@ class EpisodeBatch:
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Restore a state returned by :meth:`get_state` of a batch of the same kind, and return its
-        observations and ``info``; raise ValueError if a shape is wrong."""
+        """Restore a state returned by :meth:`get_state` of a batch of the same kind; return its observations
+        and ``info``. Raise ValueError if a shape is wrong."""
         self._simulator.set_state(state.simulation)
         changed = self.draws.put(dict(enumerate(state.values)))
         if self._stages:
@@ -603,7 +604,8 @@ class EpisodeBatch:
         return terms
 
     def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
-        """Return the steps taken in the episodes, shape [batch]; raise ResetNeeded if fewer remain in one."""
+        """Return the steps taken in the episodes, shape [batch]; raise ResetNeeded if an episode has fewer
+        left."""
         if self._steps is None:
             raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)
@@ -692,7 +694,7 @@ class EpisodeBatch:
 
 
 class Restorable:
-    """Copying and pickling of environments by their arguments and state.
+    """Copying and pickling of environments, by their arguments and state.
 
     Attributes:
         batch: The episodes.
@@ -715,7 +717,7 @@ class Restorable:
     _spec: EnvSpec | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, state and random numbers; raise TypeError if the simulator was changed
+        """Return arguments, state and random number generators; raise TypeError if the simulator was changed
         directly."""
         batch = self.batch
         if batch.changed_by_hand or batch.problem.simulator.changes != batch._changes:
@@ -739,8 +741,8 @@ class Restorable:
         self._np_random, self._np_random_seed = kept["random"]
 
     def _first_seeds(self, seed: int | Sequence[int] | None) -> Sequence[int] | None:
-        """Return the seeds of the sub-environments' randomisation, from ``np_random`` if none was given; None
-        to continue the random sequences."""
+        """Return the randomisation seeds of the sub-environments, from ``np_random`` if no seed was given;
+        None to continue the random sequences."""
         count = self.batch.size
         if seed is None and not self._is_seeded:
             seed = [int(one) for one in self.np_random.integers(2**31, size=count)]  # type: ignore[attr-defined]

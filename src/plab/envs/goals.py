@@ -1,5 +1,5 @@
-"""Goal-conditioned wrapper of an environment, with the interface of Gymnasium-Robotics' ``GoalEnv``, for
-hindsight replay."""
+"""Goal-conditioned environment wrapper for hindsight replay, with the ``GoalEnv`` interface of
+Gymnasium-Robotics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "targ
 class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray], np.ndarray]):
     """Environment with the observations ``observation``, ``achieved_goal`` and ``desired_goal``.
 
-    These are the state, and the current and the target mass distribution on a coarse grid. Rewards are
+    These are the state, and the current and target mass distributions on a coarse grid. Rewards are
     computed by :meth:`compute_reward`.
     """
 
@@ -32,8 +32,8 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         self.observation_space = goals
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Return minus the fraction of the mass in a wrong cell, for one goal or many: fractions of the mass
-        in each cell, shape [..., cell, cell, cell]. ``info`` is ignored."""
+        """Return minus the fraction of misplaced mass, for one goal or many, given fractions of the mass in
+        each cell, shape [..., cell, cell, cell]. ``info`` is ignored."""
         return -0.5 * np.abs(achieved_goal - desired_goal).sum(axis=(-3, -2, -1))
 
     def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Observations of environments: entries, spaces, and derivatives."""
+"""Observations of environments: entries, spaces and derivatives."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Observer:
 
     Attributes:
         stride: Stride between observed particles.
-        constant: Number of last entries of an observation that are constant in an episode.
+        constant: Number of trailing entries of an observation that are constant within an episode.
     """
 
     def __init__(
@@ -56,8 +56,8 @@ class Observer:
         )
 
     def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
-        """Return observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses,
-        shape [batch, manipulator, 8]; ``dtype`` applies to arrays."""
+        """Return observations, shape [batch, entry], given particles, shape [batch, observed, 6], and all
+        poses, shape [batch, manipulator, 8]; ``dtype`` applies to arrays."""
         size = len(particles)
         rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
         rows.append(self._target.like(rows[0]))
@@ -70,7 +70,7 @@ class Observer:
 
     def pull_back(self, bar: Array) -> tuple[Array, Array]:
         """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
-        [batch, manipulator, 8], from those with respect to observations, shape [batch, entry]."""
+        [batch, manipulator, 8], given those with respect to observations, shape [batch, entry]."""
         size, particles = len(bar), 6 * self._count
         whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
         # The entries after the poses are constant.
@@ -96,8 +96,8 @@ class SurfacePoints:
 
     def __call__(self, like: Array) -> Array:
         """Return points of the current states, shape [batch, point, 3], float32. With cameras, a fourth entry
-        is 1 for points visible to any of them, otherwise 0. If the surface has fewer particles, interior ones
-        are appended. A CUDA tensor if ``like`` is one."""
+        is 1 for points visible to any of them, otherwise 0. If the surface has too few particles, interior
+        ones are appended. If ``like`` is a CUDA tensor, so is the result."""
         import torch
 
         x = torch.as_tensor(self._simulator.observe(1, like)[..., :3]).float()
@@ -120,7 +120,7 @@ class SurfacePoints:
         return points if on_device(like) else points.numpy()
 
     def _sees(self, sensor: CameraSensor, points: Any, like: Array) -> Any:
-        """Return the visibility of points, shape [batch, point, 3], from a camera."""
+        """Return whether points, shape [batch, point, 3], are visible to a camera."""
         import torch
 
         camera = sensor.camera
@@ -138,10 +138,10 @@ class SurfacePoints:
 
 
 class Sensors:
-    """Observations by key: state, particles, and camera pictures.
+    """Observations by key: state, particles and camera images.
 
     Attributes:
-        names: Names of the observations, out of :data:`OBSERVATIONS`.
+        names: Names of the observations, from :data:`OBSERVATIONS`.
         space: Space of one environment's observation: a Box for a single observation, or a Dict.
     """
 
@@ -164,7 +164,7 @@ class Sensors:
             points: Number of ``points``.
 
         Raises:
-            ValueError: If there is no such observation, or nothing to observe.
+            ValueError: If an observation does not exist, or there is nothing to observe.
         """
         self.names = (observe,) if isinstance(observe, str) else tuple(observe)
         for name in self.names:
@@ -219,7 +219,7 @@ class Sensors:
 
     def __call__(self, state: Callable[[], Array], like: Array) -> Any:
         """Return observations of the current states; ``state`` is a function that returns the observation of
-        this name. CUDA tensors if ``like`` is one."""
+        that name. If ``like`` is a CUDA tensor, so are the results."""
         out = {
             name: state() if source is None else _single(source(like))
             for name, source in self._sources.items()
@@ -232,8 +232,8 @@ class Sensors:
     def noisy(
         self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
     ) -> Any:
-        """Return observations of a batch with Gaussian noise, within their space; colours and labels have no
-        noise, nor have the last ``constant`` entries of ``state``.
+        """Return observations of a batch with Gaussian noise, clipped to their space. Colours, labels and the
+        last ``constant`` entries of ``state`` have no noise.
 
         ``deviations`` are standard deviations, shape [batch]; ``rngs`` are one generator per environment.
         """
@@ -263,7 +263,7 @@ class Sensors:
 
 
 class _OfTargets:
-    """An observation of the targets' mass tensors, updated when these change."""
+    """Observation of the targets' mass tensors, updated when they change."""
 
     def __init__(self, simulator: Simulator, observe: Callable[[np.ndarray], np.ndarray]) -> None:
         self._simulator, self._observe = simulator, observe
@@ -317,15 +317,15 @@ def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
 
 
 def mapped(function: Callable[..., Any], *observations: Any) -> Any:
-    """Apply a function to observations, or to each entry of a dictionary."""
+    """Apply a function to observations, or to each entry of an observation dictionary."""
     if not isinstance(observations[0], Mapping):
         return function(*observations)
     return {key: function(*(one[key] for one in observations)) for key in observations[0]}
 
 
 def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
-    """Return the indices of the entries that are positions along x and along z, shape [2, position]: of the
-    observed particles, of the manipulators and, if it is observed, of the target."""
+    """Return the indices of the entries that are positions along x and along z, shape [2, position]: those of
+    observed particles, manipulators and, if observed, the target."""
     particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
     # Excess mass, then missing mass: fraction, centroid (3) and standard deviations (3) of each.
     centroids = [1, 8] if cfg.observe_target else []
@@ -338,7 +338,8 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return the indices of the observed pose entries, 8 per manipulator; the gap counts for grippers."""
+    """Return the indices of the observed pose entries, 8 per manipulator; the gap is included for
+    grippers."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.kind.grips for m in scene.manipulators]
     return np.flatnonzero(observed)
@@ -353,7 +354,7 @@ def _count(scene: Scene, least: int) -> int:
 
 
 def _target_observations(problem: Problem, known: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return the description of each environment's target, shape [batch, 14], given some of them."""
+    """Return the target observation of each environment, shape [batch, 14], given some of them."""
     others = [e for e in range(len(problem.scenes)) if e not in known]
     pairs = [(problem.initial_mass[e], problem.target_mass[e]) for e in others]
     # Targets may repeat within a batch.
@@ -364,7 +365,7 @@ def _target_observations(problem: Problem, known: Mapping[int, np.ndarray]) -> n
 
 
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
-    """Return the spaces of observations, with the entries of a configuration, and of actions; they cover all
+    """Return the observation space, with the entries of a configuration, and the action space; they cover all
     scenes."""
     observed = _count(scenes[0], cfg.observe_particles)
     # Faster particles cross the domain in one substep, which is a SimulationError.
@@ -380,7 +381,7 @@ def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
 
 
 def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
-    """Return the lowest and the highest poses of the manipulators, 8 numbers each."""
+    """Return the lowest and highest poses of the manipulators, 8 numbers each."""
     low, high = [], []
     for m in scene.manipulators:
         widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.kind.grips else m.gap

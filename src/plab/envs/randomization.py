@@ -1,4 +1,4 @@
-"""Differences between episodes: domain randomisation, and stages, a sequence of targets.
+"""Differences between episodes: domain randomisation, and stages (sequences of targets).
 
 Scenes, initial states, targets and noise are sampled at every reset. All of them are data of the simulator,
 so nothing is recompiled. Samples depend only on the environment's seed and the number of the episode, not on
@@ -43,7 +43,7 @@ Target = tuple[np.ndarray, np.ndarray]
 
 @dataclass(eq=False)
 class _Base:
-    """A scene to be randomised: a sub-environment's own, or one of the random scenes."""
+    """Scene to be randomised: a sub-environment's own, or one of the random scenes."""
 
     cfg: Config
     scene: Scene
@@ -71,7 +71,7 @@ class EpisodeRandomizer:
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Check that scenes can be simulated over the whole ranges, and build the random scenes.
+        """Build the random scenes, and check that scenes can be simulated over the whole ranges.
 
         ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; raise ConfigError
         if a range is invalid.
@@ -134,18 +134,18 @@ class EpisodeRandomizer:
         """Sample the next episodes of some sub-environments, and update the simulator's scenes and targets.
 
         Args:
-            environments: Their numbers.
+            environments: Numbers of the sub-environments.
             seeds: Entropy of each sub-environment.
             given: Values by dotted key that replace samples, for all or one per sub-environment of the batch;
                 ValueError if a key is unknown, or a scene cannot be simulated with a value.
 
         Returns:
-            Whether anything differs from the episodes before.
+            Whether anything differs from the previous episodes.
         """
         return self.put({e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)})
 
     def put(self, values: Mapping[int, Values]) -> bool:
-        """Apply values to some sub-environments; return whether there are any."""
+        """Apply values to some sub-environments; return whether any values were given."""
         values = {e: own for e, own in values.items() if own != self.values[e]}
         if not values:
             return False
@@ -182,7 +182,7 @@ class EpisodeRandomizer:
                 values[key] = checked(cfg.task, key, value[e] if each else value, key)
         if SCENE in values and values[SCENE] not in range(len(pool)):
             raise ArgumentError(
-                f"options['scene']: {values[SCENE]} is not below task.randomize.scenes={len(pool)}"
+                f"options['scene']: {values[SCENE]} must be below task.randomize.scenes={len(pool)}"
             )
         return values
 
@@ -193,7 +193,8 @@ class EpisodeRandomizer:
         return build_scene(cfg)
 
     def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
-        """Return the target of a scene; that of the base scene if it is simulated or read from a file."""
+        """Return the target of a scene, or of the base scene if the target is simulated or read from a
+        file."""
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
@@ -211,7 +212,7 @@ def _places(scene: Scene) -> list[Any]:
 
 
 def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np.ndarray:
-    """Return the particle positions of a scene with its bodies at the sampled poses, shape [particle, 3]."""
+    """Return the particle positions of a scene whose bodies are at the sampled poses, shape [particle, 3]."""
     x, bodies = base.particles.copy(), base.scene.particle_bodies
     for number, (name, body) in enumerate(zip(base.cfg.task.bodies, base.scene.bodies, strict=True)):
         own, center = bodies == number, np.array(places[number][0])
@@ -223,7 +224,7 @@ def _moved(base: _Base, turns: Mapping[str, float], places: Sequence[Any]) -> np
 
 
 def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
-    """Build the random scenes and targets of a configuration's episodes."""
+    """Build the random scenes and targets for the episodes of a configuration."""
     drawn = drawn_scenes(cfg, range(int(cfg.task.randomize[SCENES])))
     pool: list[_Base] = []
     own, size = simulator.scenes, simulator.batch
@@ -242,8 +243,8 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
 
 
 def staged(cfg: Config) -> bool:
-    """Return True if the task has stages before its target; raise ConfigError if targets are randomised,
-    too."""
+    """Return True if the task has stages before its target; raise ConfigError if targets are randomised as
+    well."""
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
         raise ConfigError("task.randomize cannot have scenes or targets in a task with task.stages")
     return bool(cfg.task.stages)
@@ -255,12 +256,12 @@ class Stages:
     Attributes:
         current: Number of each sub-environment's stage, shape [batch].
         earned: Sum of the rewards of completed stages, shape [batch].
-        scores: Score of each stage, shape [batch, stage]; 0 for later ones.
+        scores: Score of each stage, shape [batch, stage]; 0 for future stages.
     """
 
     def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
         """Build the targets; ``problem`` has those of the last stage. Raise ConfigError if the
-        sub-environments differ in the number of stages."""
+        sub-environments have different numbers of stages."""
         if len({len(cfg.task.stages) for cfg in cfgs}) > 1:
             raise ConfigError("task.stages differ in number between sub-environments")
         self._targets = []
@@ -281,14 +282,14 @@ class Stages:
         return self.current == len(self._targets) - 1
 
     def enter(self, stages: np.ndarray, problem: Problem) -> None:
-        """Set the targets of all sub-environments to those of their stages, shape [batch]."""
+        """Set the targets of all sub-environments to the targets of their stages, shape [batch]."""
         rows = np.flatnonzero(stages != self.current)
         if rows.size:
             problem.vary(problem.scenes, {}, {int(e): self._targets[stages[e]][e] for e in rows})
         self.current = stages
 
     def begin(self, rows: Sequence[int], problem: Problem) -> bool:
-        """Reset some sub-environments to the first stage; return whether any was in another."""
+        """Reset some sub-environments to the first stage; return whether any of them was in another stage."""
         stages, rows = self.current.copy(), list(rows)
         stages[rows], self.earned[rows], self.scores[rows] = 0, 0.0, 0.0
         changed = bool((stages != self.current).any())

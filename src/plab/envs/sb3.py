@@ -1,4 +1,5 @@
-"""Many environments in one simulator for Stable-Baselines3: ``make_sb3("plab/Rope-v1", num_envs=8)``."""
+"""Vectorised environments in one simulator for Stable-Baselines3: ``make_sb3("plab/Rope-v1",
+num_envs=8)``."""
 
 from __future__ import annotations
 
@@ -23,21 +24,21 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
     """Create the environments of a registered id.
 
     Args:
-        env_id: Such as ``plab/Rope-v1``.
+        env_id: Id, such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
         render_mode: ``rgb_array``, or None for no pictures.
         **options: Arguments of :func:`plab.envs.core.compose_configs` and
-            :class:`plab.envs.core.EpisodeBatch`, which have the errors, too. With several observations, the
-            policy must accept dictionaries, such as ``MultiInputPolicy``.
+            :class:`plab.envs.core.EpisodeBatch`, whose errors apply. With multiple observations, the policy
+            must accept dictionaries, as ``MultiInputPolicy`` does.
 
     Raises:
-        gymnasium.error.Error: If there is no such id.
-        ValueError: If the id is not one of plab's.
+        gymnasium.error.Error: If the id does not exist.
+        ValueError: If the id does not belong to plab.
     """
     spec = gymnasium.spec(env_id)
     if spec.entry_point != ENTRY_POINT:
         raise ArgumentError(
-            f"'{env_id}' is not an environment of plab: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
+            f"'{env_id}' is not a plab environment: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
     batch = make_batch(num_envs=num_envs, **spec.kwargs | options)
     return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
@@ -51,7 +52,7 @@ class PlabVecEnv(VecEnv):
         spec: Gymnasium's specification of one sub-environment, if any, with ``sim.horizon`` steps.
         together: Whether all episodes end together: a diverged episode is then frozen until the end, with the
             reason as ``failure`` in its infos. Otherwise it is truncated and reset immediately.
-        next_episode: Number of the episodes started by the next :meth:`reset`; default: the following one.
+        next_episode: Episode number at the next :meth:`reset`; default: the following one.
     """
 
     together = False
@@ -84,7 +85,7 @@ class PlabVecEnv(VecEnv):
         are in ``reset_infos``. ``seed`` and ``set_options`` are those of
         :meth:`plab.envs.single.PlabEnv.reset`; options are the same for all sub-environments."""
         if any(options != self._options[0] for options in self._options):
-            raise ArgumentError("options differ between sub-environments: give one value for each")
+            raise ArgumentError("options differ between sub-environments: pass the same value for all")
         seeds = [seed for seed in self._seeds if seed is not None] or None
         observation, info = self.batch.reset(seeds=seeds, options=self._options[0], episode=self.next_episode)
         self.next_episode = None
@@ -98,7 +99,7 @@ class PlabVecEnv(VecEnv):
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Advance all sub-environments by one step, and reset them if that ends their episodes.
+        """Advance all sub-environments by one step, and reset those whose episodes end.
 
         Errors are those of :meth:`plab.envs.core.EpisodeBatch.step`.
         """
@@ -134,7 +135,9 @@ class PlabVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all sub-environments; raise ValueError if only some are selected."""
         if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
+            raise ArgumentError(
+                f"'{attr_name}' cannot be set for individual sub-environments, because all share it"
+            )
         setattr(self, attr_name, value)
 
     def env_method(

@@ -1,4 +1,4 @@
-"""One environment for Gymnasium: ``gymnasium.make("plab/Rope-v1")``."""
+"""Single environment for Gymnasium: ``gymnasium.make("plab/Rope-v1")``."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
 
         Args:
             task: Name of the task.
-            variant: Name of its variant.
+            variant: Name of the variant.
             render_mode: ``rgb_array``, or None for no pictures.
             **options: Arguments of :func:`plab.envs.core.compose_configs` and
-                :class:`plab.envs.core.EpisodeBatch`, which have the errors, too.
+                :class:`plab.envs.core.EpisodeBatch`, whose errors apply.
         """
         self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}
         self.render_mode = check_render_mode(render_mode)

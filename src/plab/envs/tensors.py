@@ -1,4 +1,4 @@
-"""Batch of episodes with tensors as inputs and outputs, for custom PyTorch training loops."""
+"""Batch of episodes with PyTorch tensors as inputs and outputs, for custom training loops."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from plab.sim import Simulator
 
 
 def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
-    """Return actions as floating-point numbers, integers in the simulator's precision; raise TypeError if
-    they are complex."""
+    """Return actions as floating-point numbers, converting integers to the simulator's precision; raise
+    TypeError for complex numbers."""
     if actions.is_complex():
         raise TypeError(f"actions must be real numbers, not {actions.dtype}")
     return actions if actions.is_floating_point() else actions.to(getattr(torch, simulator.precision))

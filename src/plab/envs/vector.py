@@ -1,4 +1,5 @@
-"""Many environments in one simulator for Gymnasium: ``gymnasium.make_vec("plab/Rope-v1", num_envs=8)``."""
+"""Vectorised environments in one simulator for Gymnasium: ``gymnasium.make_vec("plab/Rope-v1",
+num_envs=8)``."""
 
 from __future__ import annotations
 
@@ -46,14 +47,14 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         Args:
             num_envs: Number of sub-environments.
             task: Name of the task.
-            variant: Name of its variant.
+            variant: Name of the variant.
             render_mode: ``rgb_array``, or None for no pictures.
             autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``NextStep`` resets in the
                 step after the end of an episode, which ignores the action; ``SameStep`` in the last step of
                 the episode, with the final observation in ``infos["final_obs"]``; ``Disabled`` requires
                 :meth:`reset` with ``options={"reset_mask": ...}``.
             **options: Arguments of :func:`plab.envs.core.compose_configs` and
-                :class:`plab.envs.core.EpisodeBatch`, which have the errors, too.
+                :class:`plab.envs.core.EpisodeBatch`, whose errors apply.
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
@@ -89,7 +90,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ArgumentError(
-                f"reset_mask must be {self.num_envs} booleans, one at least True (got {mask})"
+                f"reset_mask must be {self.num_envs} booleans, at least one of them True (got {mask})"
             )
         super().reset(seed=seed if seed is None or isinstance(seed, int) else seed[0])
         seeds = self._first_seeds(seed)
@@ -153,7 +154,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         return {"failure": texts} if failures else {}
 
     def _masked(self, info: Mapping[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Add Gymnasium's masks of the sub-environments that have an entry; the others have 0."""
+        """Add Gymnasium's masks of the sub-environments that have an entry; other entries are 0."""
         out: dict[str, Any] = {}
         for name, values in info.items():
             own = np.ones(self.num_envs, bool) if mask is None else mask.copy()

@@ -1,4 +1,4 @@
-"""Result files: one HDF5 file per run, replaced atomically while it runs, loaded into pandas afterwards.
+"""Result files: one HDF5 file per run, replaced atomically during the run, and loaded into pandas afterwards.
 
 The layout is described in docs/developers/format.md. A run in progress stores its state in
 ``<name>.partial.h5``, which is replaced atomically at intervals: after a kill, the previous version remains,
@@ -61,7 +61,7 @@ _MODULES = {
     "checking": ("check",),
     "table": ("Row", "connect", "load", "read_curves", "rows"),
 }
-"""Names of each module that is imported on first use."""
+"""Exported names by module, imported on first use."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""``python -m plab.results``: the same as ``plab results``."""
+"""``python -m plab.results``: alias of ``plab results``."""
 
 from plab.cli.results import main
 

@@ -1,4 +1,4 @@
-"""Archives: many runs in one file, for publishing or keeping under version control.
+"""Archives: many runs in one file, for publication or version control.
 
 An archive is a zip file of result files, reduced to the data for tables, curves and pictures and compressed
 as a whole by xz, which exploits redundancy between runs; ``unxz`` and any zip program unpack it. Its members
@@ -30,21 +30,21 @@ def pack(
     chosen: Selection | None = None,
     digits: int | None = None,
 ) -> tuple[int, list[ResultsError]]:
-    """Write finished runs into an archive, in one atomic step, without mass tensors, which can be recomputed
-    from the best actions.
+    """Write finished runs into an archive atomically, without mass tensors, which can be recomputed from the
+    best actions.
 
-    Runs in archives below ``source`` are included; packing again therefore adds new runs, also if the archive
-    itself is there. ``results_dir`` becomes ``results``.
+    Runs in archives below ``source``, including ``archive`` itself, are packed too, so that packing again
+    adds new runs. ``results_dir`` becomes ``results``.
 
     Args:
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
         chosen: Selection of runs; None: all.
-        digits: Least number of significant digits of the iterations, >= 1; None: all. Four digits reduce the
-            size by two thirds. Actions and the final evaluation keep all digits.
+        digits: Minimum number of significant digits of the iterations, >= 1; None: all. Four digits reduce
+            the size by two thirds. Actions and the final evaluation keep all digits.
 
     Returns:
-        Number of runs in the archive, and the errors of unreadable files, which are not in it.
+        Number of runs in the archive, and the errors of unreadable files, which are omitted.
 
     Raises:
         ResultsError: If there is nothing to pack, none of the files or archives in ``source`` can be read,
@@ -75,7 +75,7 @@ def pack(
 
 
 def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
-    """Return a zip file of some members, byte-identical for equal members."""
+    """Return a zip file of some members; equal members give identical bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, data in members:
@@ -87,7 +87,7 @@ def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
 
 
 def _rounded(run: RunResult, digits: int) -> RunResult:
-    """Round a run's iterations, and the lowest loss with them."""
+    """Round the iterations of a run, and its lowest loss with them."""
     # An error of at most half of the last digit of 1.00...: 2^-bits <= 0.5 * 10^(1 - digits).
     bits = min(math.ceil(1.0 + (digits - 1) * math.log2(10.0)), 53)
 
@@ -109,7 +109,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
         folder: Destination folder.
 
     Returns:
-        Number of files written, and of existing files.
+        Number of written files, and of existing files.
 
     Raises:
         ResultsError: If the archive cannot be read or a file cannot be written.

@@ -1,4 +1,4 @@
-"""Checks of result files against the schema."""
+"""Validation of result files against the schema."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from plab.results.run_file import (
 from plab.results.table import read_each, run_files
 
 _TOLERANCE = 1e-9
-"""Relative error allowed between a score and the IoUs that it is computed from."""
+"""Relative tolerance between a score and the IoUs that it is computed from."""
 
 
 def check(source: str | Path) -> Iterator[tuple[Path, str]]:
-    """Check all result files of a folder, all runs of an archive, or one file, in full.
+    """Check all result files of a folder, all runs of an archive, or one file in full.
 
     Args:
         source: Folder of results, archive or result file.
 
     Yields:
-        Each file, or member of an archive, with its faults in a line, empty if there are none. Unreadable
+        Each file, or member of an archive, with its faults in one line, empty if there are none. Unreadable
         members are reported with the archive's path.
 
     Raises:
@@ -54,7 +54,7 @@ def faults(run: RunResult) -> list[str]:
     """Return the faults of a readable run."""
     partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
     checks: list[Check] = [
-        (run.status in STATUSES, f"status {run.status!r:.80} is none of {', '.join(STATUSES)}"),
+        (run.status in STATUSES, f"status {run.status!r:.80} is not one of {', '.join(STATUSES)}"),
         (partial != (run.status == "finished"), f"the name does not fit the status {run.status}"),
         (config_hash(run.config) == run.config_hash, "config_hash is not that of config"),
     ]
@@ -64,7 +64,7 @@ def faults(run: RunResult) -> list[str]:
 
 
 Check: TypeAlias = tuple[Any, str]
-"""Result of a requirement, true if it is met, and the fault to report otherwise."""
+"""Whether a requirement is met, and the fault to report otherwise."""
 
 
 def _iteration_checks(run: RunResult) -> list[Check]:

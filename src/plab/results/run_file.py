@@ -1,4 +1,4 @@
-"""File of one run: schema, HDF5 written atomically, and read from a file or an archive."""
+"""Run files: schema, atomic writing as HDF5, and reading from a file or an archive."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from plab.files import LARGEST, UnreadableError, member_bytes, one_line, opened_
 from plab.plugins import pandas as pd
 
 SCHEMA_VERSION = 2
-"""Version of the file layout; files of another version are not read."""
+"""Version of the file layout; files with another version are rejected."""
 
 STATUSES = ("running", "finished", "failed", "stopped")
 
 NAMES = ("task", "variant", "method", "seed")
-"""Columns that name a run in tables."""
+"""Columns that identify a run in tables."""
 
 PARTIAL_SUFFIX = ".partial.h5"
 REPLAY_SUFFIX = ".replay"
@@ -39,7 +39,7 @@ ARCHIVE_SUFFIX = ".plab.zip.xz"
 _MEASURES = ("loss", "reward", "iou", "score")
 
 BUDGETS = ("steps_forward", "steps_gradient")
-"""Columns of the environment steps simulated up to the end of a row, without and with gradient."""
+"""Columns with the number of environment steps simulated so far, without and with gradient."""
 
 COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 """Columns of the iterations of all methods, in addition to :func:`loss_columns`; :mod:`plab.config.families`
@@ -68,15 +68,15 @@ _images = itertools.count()
 
 
 class ResultsError(PlabError, RuntimeError):
-    """A result file cannot be read or written; the message names the file and the reason."""
+    """Unreadable or unwritable result file; the message names the file and the reason."""
 
 
 class NewerSchemaError(ResultsError):
-    """A result file has a newer schema version; it is never moved or replaced."""
+    """Result file with a newer schema version, which is never moved or replaced."""
 
 
 class RunBusyError(ResultsError):
-    """A run is in progress in another process."""
+    """Run in progress in another process."""
 
     exit_code = 1
 
@@ -96,12 +96,12 @@ class RunResult:
             docs/results.md.
         best_actions: Best actions found, in [-1, 1], shape [T, A]; None before the first iteration.
         best_iteration: Iteration of the best actions, -1 if there are none.
-        best_loss: Their trajectory loss in the contact model of the rollouts.
-        evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
-        labels: Meaning and unit of the loss's terms, by column.
+        best_loss: Trajectory loss of the best actions, in the contact model of the rollouts.
+        evaluation: Scalars of the final evaluation in the hard contact model; empty until then.
+        labels: Meanings and units of the loss terms, by column.
         masses: Mass tensors by name (``initial``, ``final``, ``target``), each of shape [n, n, n].
         resume: Nested state for resuming the run: arrays, numbers, strings; None in finished files.
-        path: File this was read from.
+        path: Source file.
     """
 
     config: dict[str, Any]
@@ -127,17 +127,17 @@ class RunResult:
 
     @property
     def iterations(self) -> pd.DataFrame:
-        """The columns as a table, a row per iteration or evaluation; changes do not affect the columns."""
+        """Copy of the columns as a table, with one row per iteration or evaluation."""
         return pd.DataFrame(self.columns)
 
     @property
     def score(self) -> float:
         """Score of a finished run under its protocol, in [0, 1].
 
-        With ``protocol.score=best`` the score of the final evaluation; with ``last`` that of the last
-        iteration, in the contact model of the iterations, as logged by the PlasticineLab release; for
-        policies the mean over the last, exploratory training episodes. Methods that select by score, such as
-        planners, and external methods always use the final evaluation.
+        With ``protocol.score=best``, this is the score of the final evaluation. With ``last``, it is the
+        score of the last iteration in the contact model of the iterations, as logged by the PlasticineLab
+        release, or for policies the mean over the last, exploratory training episodes. Methods that select by
+        score, such as planners, and external methods always use the final evaluation.
         """
         if scores_last_iteration(self.config):
             return last_score(self.columns)
@@ -158,25 +158,25 @@ def stored_config(text: str) -> dict[str, Any]:
 
 
 def scores_last_iteration(config: Mapping[str, Any]) -> bool:
-    """Return whether a run's score is that of its last iteration: see :attr:`RunResult.score`."""
+    """Return whether a run's score is the score of its last iteration: see :attr:`RunResult.score`."""
     own = FAMILIES.get(config["method"]["family"])
     return config["protocol"]["score"] == "last" and own is not None and own.ranking == "loss"
 
 
 def last_score(rows: Mapping[str, np.ndarray]) -> float:
-    """Return the score of the last iteration as simulated, given the columns of the iterations."""
+    """Return the simulated score of the last iteration, given the columns of the iterations."""
     trained = rows.get("train_score", [np.nan])[-1]
     # There may be no completed training episode.
     return float(rows["score"][-1] if np.isnan(trained) else trained)
 
 
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the columns of the loss terms of a configuration with nonzero weight."""
+    """Return the columns of the loss terms with nonzero weight in a configuration."""
     return tuple(f"loss_{name}" for name, weight in config["method"]["loss_weights"].items() if weight)
 
 
 def row_count(method: Mapping[str, Any]) -> int | None:
-    """Return the number of rows of a finished run, if the section ``method`` determines it."""
+    """Return the number of rows of a finished run, if the ``method`` section determines it."""
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")
@@ -191,7 +191,7 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
     Args:
         result: Result to write.
         path: File to create or replace.
-        compress: Compress the arrays (gzip) and flush to disk, for the final file.
+        compress: Whether to compress the arrays (gzip) and flush to disk, for the final file.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then unchanged.
@@ -204,8 +204,8 @@ def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> Non
 
     Args:
         path: The file.
-        content: Its content; text in UTF-8.
-        sync: Flush the file to disk.
+        content: Content; text is encoded as UTF-8.
+        sync: Whether to flush the file to disk.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then unchanged.
@@ -228,19 +228,19 @@ def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> Non
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
-    """Return the bytes of the HDF5 file, built in memory, so that a full disk raises a plain OSError.
+    """Return the bytes of the HDF5 file, built in memory so that a full disk raises a plain OSError.
 
     Targets from user files are left out, because their licence is unknown.
     """
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if compress else {}
-    # A name of its own: Ctrl-C inside h5py can leave the previous image open, under its name.
+    # A unique name, because Ctrl-C inside h5py can leave the previous image open under its name.
     name = f"image{next(_images)}"
     with h5py.File(name, "w", driver="core", backing_store=False, libver=_COMPACT) as file:
         file.attrs["format"] = "plab-run"
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["config"] = json.dumps(result.config)
         summary = {name: getattr(result, name) for name in _SUMMARY} | {"columns": list(result.columns)}
-        # NumPy's scalars become Python's.
+        # Convert NumPy scalars to Python scalars.
         file.attrs["summary"] = json.dumps(summary, default=lambda value: value.item())
         for column, values in result.columns.items():
             file.create_dataset(f"iterations/{column}", data=values, **options)
@@ -289,7 +289,7 @@ def read(path: str | Path) -> RunResult:
 
 
 def run_of(file: h5py.File, path: Path) -> RunResult:
-    """Return all of an open run."""
+    """Return the complete content of an open run."""
     summary = summary_of(file)
     return RunResult(
         config=stored_config(file.attrs["config"]),
@@ -303,7 +303,7 @@ def run_of(file: h5py.File, path: Path) -> RunResult:
 
 
 def split_archive(path: Path) -> tuple[Path, str] | None:
-    """Return archive and member of a path into an archive, None for any other path."""
+    """Return archive and member of a path into an archive, or None for any other path."""
     for folder in path.parents:
         if folder.name.endswith(ARCHIVE_SUFFIX) and folder.is_file():
             return folder, path.relative_to(folder).as_posix()
@@ -312,7 +312,7 @@ def split_archive(path: Path) -> tuple[Path, str] | None:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open a run of this schema version, a file or a member of an archive.
+    """Open a run with this schema version, from a file or a member of an archive.
 
     Raises:
         ResultsError: If it cannot be opened, or its reading fails inside the ``with`` block.
@@ -358,7 +358,7 @@ def explained(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise ResultsError(f"{path} does not exist") from error
     except PermissionError as error:
-        raise ResultsError(f"{path} may not be read ({error.strerror or error})") from error
+        raise ResultsError(f"{path} cannot be opened ({error.strerror or error})") from error
     except UnreadableError as error:
         raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
     except Exception as error:
@@ -403,7 +403,7 @@ def actions_of(file: h5py.File) -> np.ndarray | None:
 
 
 def _numbers(file: h5py.Group, path: str) -> np.ndarray:
-    """Return a dataset of numbers, which must be in this file and of a size that the file can hold."""
+    """Return a numeric dataset, which must be stored in this file and no larger than the file can hold."""
     # Several times as fast as h5py's high-level interface; a file has twenty datasets.
     found = h5py.h5d.open(file.id, path.encode())
     plist, info = found.get_create_plist(), h5py.h5o.get_info
@@ -420,7 +420,7 @@ def _numbers(file: h5py.Group, path: str) -> np.ndarray:
 
 
 def _tree(group: h5py.Group) -> dict[str, Any]:
-    """Return the content of a group: nested dictionaries of arrays of numbers and of texts."""
+    """Return the content of a group as nested dictionaries of numeric and string arrays."""
     found: dict[str, Any] = {}
     for name, member in group.items():
         if isinstance(member, h5py.Group):

@@ -1,4 +1,4 @@
-"""A run in progress: file, checkpoints, resumption, lock and provenance.
+"""Runs in progress: file, checkpoints, resumption, lock and provenance.
 
 Locks are operating-system locks (``flock``, on Windows ``msvcrt``) of ``<run>.lock`` beside the run's files.
 A lock is released when its process ends, so leftover lock files are not locked. On network file systems with
@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 
 class RunFile:
-    """Result file of a run in progress: resumes an earlier state, records rows, and finishes.
+    """Result file of a run in progress, which resumes an earlier state, records rows, and finishes.
 
     Unless the run is complete, it holds the run's lock until it is closed, finished or released.
 
@@ -59,8 +59,8 @@ class RunFile:
         """Open the file of a configuration's run.
 
         Raises:
-            RunBusyError: If another process computes the run.
-            NewerSchemaError: If a file of the run was written by a newer plab.
+            RunBusyError: If another process is computing the run.
+            NewerSchemaError: If a file of the run was written by a newer version of plab.
             ResultsError: If the folder is not writable or the disk is full, before anything is computed.
         """
         config = config_dict(cfg)
@@ -118,13 +118,13 @@ class RunFile:
                 lock.release()
 
     def _remove(self, *suffixes: str) -> None:
-        """Remove temporary files of the run, and those with the given suffixes."""
+        """Remove temporary files of the run, and files with the given suffixes."""
         for path in self.path.parent.glob(f"{self.path.stem}.*"):
             if path.name.endswith((".tmp", *suffixes)):
                 path.unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """Release a rejected run, and remove its files unless it can resume from them."""
+        """Release a rejected run, and remove its files unless it can be resumed from them."""
         if self._lock is not None and not self.result.rows:
             with suppress(OSError):
                 self._remove(PARTIAL_SUFFIX, REPLAY_SUFFIX)
@@ -134,7 +134,7 @@ class RunFile:
     def _release_empty_folders(self) -> None:
         self.release()
         with suppress(OSError):
-            # Folders of method, task and results, as far as they are empty.
+            # Remove the folders of method, task and results if they are empty.
             for folder in self.path.parents[:3]:
                 folder.rmdir()
 
@@ -148,7 +148,7 @@ class RunFile:
 
     @property
     def finished(self) -> bool:
-        """True if the run is complete, by this process or an earlier one."""
+        """True if this process or an earlier one has completed the run."""
         return self._state[0].status == "finished"
 
     @property
@@ -157,7 +157,7 @@ class RunFile:
         return self.result.rows > self._known
 
     def release(self) -> None:
-        """Release the run's lock, so that another process may resume it; nothing may be written
+        """Release the run's lock, so that another process may resume the run; nothing may be written
         afterwards."""
         if self._lock is not None:
             self._lock.release()
@@ -170,12 +170,12 @@ class RunFile:
     def record(
         self, row: Mapping[str, float], resume: Mapping[str, Any], *, keep: bool = False, **changes: Any
     ) -> None:
-        """Append a row to the iterations, and rewrite the partial file after ``checkpoint_seconds``.
+        """Append a row to the iterations; rewrite the partial file if ``checkpoint_seconds`` have passed.
 
         Args:
             row: Values by column; the same columns in every call.
             resume: State for the next iteration: nested dictionaries of arrays, numbers and strings.
-            keep: Write the partial file in any case.
+            keep: Whether to write the partial file in any case.
             changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
         """
         known, rows = self._state
@@ -197,7 +197,7 @@ class RunFile:
         self._written = time.monotonic()
 
     def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
-        """Write the final file, with the scalars of the evaluation and mass tensors, each of shape [n, n, n],
+        """Write the final file, with the scalars of the evaluation and mass tensors, shape [n, n, n] each,
         and remove the partial file."""
         result = dataclasses.replace(
             self.result,
@@ -227,7 +227,7 @@ class RunFile:
         return earlier if same and earlier.status == "finished" else None
 
     def _take_up_earlier(self) -> None:
-        """Resume from an earlier process's state; unusable files are moved aside."""
+        """Resume from the state of an earlier process; unusable files are moved aside."""
         if (done := self._finished_earlier()) is not None:
             self._state = done, ()
             return
@@ -249,7 +249,9 @@ class RunFile:
             versions = (*(name.removesuffix("-core") for name in _PACKAGES), "python", "git_commit")
             if changed := [name for name in versions if before.get(name) != now[name]]:
                 listed = ", ".join(f"{name} {before.get(name)} -> {now[name]}" for name in changed)
-                _log.warning("resuming %s, begun with other versions: %s", self.partial_path, listed)
+                _log.warning(
+                    "resuming %s, which was started with other versions: %s", self.partial_path, listed
+                )
             origin = before | {"resumed": int(before.get("resumed", 0)) + 1}
             known = dataclasses.replace(earlier, status="running", message="", provenance=origin, path=None)
             self._state = known, ()
@@ -258,7 +260,7 @@ class RunFile:
 def _extended(
     columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, float]]
 ) -> dict[str, np.ndarray]:
-    """Return columns, shape [iteration] each, with more rows; missing values are NaN."""
+    """Return columns, shape [iteration] each, extended by rows; missing values are NaN."""
     known = len(next(iter(columns.values()), ()))
     extended = {}
     for name in dict.fromkeys((*columns, *rows[0])):
@@ -284,15 +286,14 @@ _PATIENCE = 0.2
 """Timeout of :func:`acquire` [s], longer than :func:`held` holds a lock."""
 
 _NOT_HELD = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EROFS)
-"""Error numbers of file systems on which no run can be in progress: without locks, or read-only."""
+"""Error numbers of file systems without locks or without write access, on which no run can be in progress."""
 
 
 class Lock:
-    """A lock held by this process until :meth:`release` or garbage collection."""
+    """Lock held by this process until :meth:`release` or garbage collection."""
 
     def __init__(self, path: str | Path, timeout: float = _PATIENCE) -> None:
-        """Acquire the lock of a run, as :func:`acquire` does; raise filelock.Timeout if it is held for
-        longer."""
+        """Acquire the lock of a run, as :func:`acquire` does; raise filelock.Timeout after the timeout."""
         file, often = lock_path(path), _PATIENCE / 8
         # The soft lock of a killed process would never be released.
         self._lock = FileLock(file, timeout, thread_local=False, poll_interval=often, fallback_to_soft=False)
@@ -350,7 +351,7 @@ _PACKAGES += ("stable_baselines3", "h5py", "hydra-core")
 
 
 def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the provenance of a run with a resolved configuration that starts now.
+    """Return the provenance of a run that starts now with a resolved configuration.
 
     Returns:
         Flat scalars: versions, platform, commit, device, precision, seed, start time. ``git_commit`` is empty
@@ -378,7 +379,7 @@ def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def now() -> str:
-    """Return the time in the format of results: UTC, ISO 8601, in seconds."""
+    """Return the current time in the format of results: UTC, ISO 8601, in seconds."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
@@ -391,7 +392,7 @@ def _version(distribution: str) -> str:
 
 @functools.cache
 def _git() -> tuple[str, bool]:
-    """Return the commit of plab's own repository ("" outside one), and whether tracked files differ."""
+    """Return the commit of plab's own repository ("" outside it), and whether tracked files differ."""
     here = Path(__file__)
 
     def git(*arguments: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables of the runs in folders and archives, with an index of unchanged files; SQL queries; scores.
+"""Tables of the runs in folders and archives, with an index of unchanged files, SQL queries and scores.
 
 The index is compressed JSON. An entry is valid only while its file has the same size, inode and times. It is
 replaced atomically, and can be deleted at any time.
@@ -57,7 +57,7 @@ T = TypeVar("T")
 _ORIGIN = {"started": "start_time"} | {
     name: name for name in ("device", "precision", "batch", "plab", "git_commit")
 }
-"""Keys of the provenance by column."""
+"""Provenance keys by column."""
 
 _BEST = ("best_iteration", "best_loss")
 
@@ -70,7 +70,7 @@ COLUMNS = (
 _INDEX = f".plab-index-{SCHEMA_VERSION}.json.gz"
 
 _TIMESTAMP_RESOLUTION = 2.0
-"""Age after which the times of a file identify its contents [s], because file systems round them."""
+"""Age above which the timestamps of a file identify its content [s], because file systems round them."""
 
 
 @dataclass(frozen=True)
@@ -99,30 +99,30 @@ file) and the two parts of :class:`Row`."""
 def load(
     source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
 ) -> pd.DataFrame:
-    """Load results, a row per run.
+    """Load results into a table with one row per run.
 
-    Partial files are included, with their status, unless the same run has a finished file; runs in archives
-    are included unless the folder has the same run as a file. Files that cannot be read are named in one
-    warning.
+    Partial files are included, with their status, unless the run also has a finished file; runs in archives
+    are included unless the folder also has them as files. One warning names all unreadable files.
 
     Args:
         source: A folder, including subfolders, an archive, a single result file, or several of them; the
             names ``example``, ``release``, ``targets`` and ``authors`` are bundled archives.
-        keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
-        index: Use and update the index of the folder.
+        keys: Dotted configuration keys to add as columns, such as ``task.yield_stress``.
+        index: Whether to use and update the index of the folder.
 
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
         best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
         of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
-        ``score_best``, ``iou`` and ``loss`` are the final evaluation's, NaN before it; ``score`` is the same,
-        or that of the last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
+        ``score_best``, ``iou`` and ``loss`` are those of the final evaluation, NaN before it. ``score``
+        equals ``score_best``, or the score of the last iteration with ``protocol.score=last``: see
+        :attr:`RunResult.score`.
 
     Raises:
-        ResultsError: As for :func:`rows`, or if ``keys`` is a text.
+        ResultsError: As for :func:`rows`, or if ``keys`` is a string.
     """
     if isinstance(keys, str):
-        raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
+        raise ResultsError(f"keys must be a list of dotted keys, such as ['{keys}'], not the string '{keys}'")
     found, unreadable = rows(source, index=index)
     warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
@@ -130,10 +130,10 @@ def load(
 
 
 def warn_of(unreadable: Sequence[ResultsError]) -> None:
-    """Warn once about all unreadable files; the warning is attributed to the caller's caller."""
+    """Issue one warning about all unreadable files, attributed to the caller's caller."""
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)
-        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
+        warnings.warn(f"skipped {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
 
 
 def rows(
@@ -156,7 +156,7 @@ def rows(
 
 
 def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return folders, archives and files; names such as ``example`` are bundled archives."""
+    """Return folders, archives and files, with names such as ``example`` replaced by bundled archives."""
     given = [source] if isinstance(source, str | Path) else source
     return [resolve(one) if isinstance(one, str) else one for one in given]
 
@@ -171,7 +171,7 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
         The columns of each run, shape [iteration] each, in the order of ``paths``.
 
     Raises:
-        ResultsError: If one cannot be read.
+        ResultsError: If a run cannot be read.
     """
     wanted = list(map(str, paths))
     archives = dict.fromkeys(inside[0] for path in wanted if (inside := split_archive(Path(path))))
@@ -190,10 +190,10 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
 
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield result files and archives of a folder with their status, sorted by name, and unreadable
-    subfolders; for a file, yield the file.
+    subfolders; yield a file itself.
 
     Raises:
-        ResultsError: If there is nothing at ``root``.
+        ResultsError: If ``root`` does not exist.
     """
     if not root.is_dir():
         try:
@@ -222,12 +222,12 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
 def read_each(
     path: Path, extract: Callable[[h5py.File, Path], T], wanted: set[str] | None = None
 ) -> Iterator[T | ResultsError]:
-    """Yield the result of ``extract`` for a result file or for each run of an archive, or an error.
+    """Yield the result of ``extract``, or an error, for a result file or for each run of an archive.
 
     Args:
         path: The file or archive.
         extract: Function of the open file and its path, or its path in an archive.
-        wanted: Places to read; None for all.
+        wanted: Members to read; None for all.
     """
     try:
         if not path.name.endswith(ARCHIVE_SUFFIX):
@@ -250,7 +250,8 @@ def read_each(
 
 
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, for unchanged files from the index."""
+    """Yield the rows of all files below a folder, or of one file; rows of unchanged files come from the
+    index."""
     files = dict(run_files(root))
     # A finished file replaces its partial file.
     for path in [path for path in files if path.name.endswith(PARTIAL_SUFFIX)]:
@@ -288,7 +289,8 @@ def _final(partial: Path) -> Path:
 
 
 def _read(path: Path) -> list[Row | ResultsError]:
-    """Return the rows of a file, or of the final file if a partial file has been replaced meanwhile."""
+    """Return the rows of a file, or of the final file if the partial file has been replaced in the
+    meantime."""
     entries = list(read_rows(path))
     if not path.exists():
         return list(read_rows(_final(path))) if _final(path).exists() else []
@@ -296,10 +298,10 @@ def _read(path: Path) -> list[Row | ResultsError]:
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:
-    """Leave out runs superseded by a finished run of the same configuration.
+    """Drop runs superseded by a finished run with the same configuration.
 
-    Among equivalent runs all separate files are kept, but only the first archived one, and none if there is a
-    separate file.
+    Among equivalent runs, all separate files are kept; without separate files, the first archived run is
+    kept.
     """
     by_hash: dict[str, list[Row]] = defaultdict(list)
     for row in found:
@@ -316,7 +318,7 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 
 def _row(file: h5py.File, path: Path) -> Row:
-    """Return the row of an open file, after checking that all columns and actions can be read."""
+    """Return the row of an open file after checking that all columns and actions can be read."""
     config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), columns_of(file)
     actions_of(file)
     if columns and (missing := [name for name in ITERATION_COLUMNS if name not in columns]):
@@ -372,7 +374,7 @@ def connect(
 
     Args:
         source: A folder, an archive, a single result file, or several of them.
-        iterations: Add the table ``iterations``, which requires opening every file.
+        iterations: Whether to add the table ``iterations``, which requires opening every file.
 
     Returns:
         A connection; ``connection.sql("select ...").df()`` is a pandas table.
@@ -388,10 +390,10 @@ def connect(
 def query(
     source: str | Path | Sequence[str | Path], sql: str
 ) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    """Answer an SQL query over the tables of :func:`connect`.
+    """Run an SQL query on the tables of :func:`connect`.
 
     Returns:
-        Names of the columns, the rows, and the errors of unreadable files.
+        Column names, rows, and errors of unreadable files.
 
     Raises:
         ArgumentError: If the query is invalid.
@@ -406,7 +408,7 @@ def query(
             answer = connection.execute(sql)
             return [column[0] for column in answer.description], answer.fetchall(), unreadable
     except duckdb.Error as error:
-        # Without hints and the marked position in the query.
+        # Omit hints and the marked position in the query.
         first = " ".join(str(error).partition("\n")[0].split())
         raise ArgumentError(f"{first}; the tables are {', '.join(_TABLES)}") from None
 
@@ -423,13 +425,13 @@ def scores(
 
     Args:
         source: Folder of results, archive, file or several of them.
-        chosen: Choice of runs.
-        keys: Additional columns: those of :func:`plab.results.load`, or dotted keys of the configuration.
-        sort: Columns to sort by; default: the identity of a run. runs without a value come last.
+        chosen: Selection of runs.
+        keys: Additional columns: columns of :func:`plab.results.load`, or dotted keys of the configuration.
+        sort: Columns to sort by; default: the identity of a run. Runs without a value come last.
         descending: Sort in descending order.
 
     Returns:
-        Columns task, variant, method, seed, protocol, targets (the files that they were taken from, None for
+        Columns task, variant, method, seed, protocol, targets (their source files, None for
         plab's own), status, score and ``keys``; ``score`` as in :func:`plab.results.load`.
 
     Raises:
@@ -441,7 +443,7 @@ def scores(
     columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
     table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
     if strange := [key for key in keys if fitting and table[key].map(lambda value: value is None).all()]:
-        raise ArgumentError(f"no run has '{strange[0]}': give columns of plab.results.load, or dotted keys")
+        raise ArgumentError(f"no run has '{strange[0]}': use columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
         raise ArgumentError(
             f"there is no column '{missing[0]}' to sort by; choose from: {', '.join(columns)}"
@@ -455,12 +457,12 @@ def scores(
 # ---------------------------------------------------------------------------------------------------- details
 
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
-"""Columns by configuration key that must agree within a mean."""
+"""Columns, by configuration key, that must agree between runs that are averaged."""
 
 _TABLES = ("runs", "config", "iterations")
 
 _TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets", "folder")
-"""Columns of ``runs`` that are texts, also if all are missing."""
+"""Text columns of ``runs``, even if all values are missing."""
 
 
 def _connected(
@@ -496,12 +498,12 @@ def _connected(
 
 
 def _value(row: Row, name: str) -> Any:
-    """Return a column or a setting of a run, or None."""
+    """Return a run's value of a column or a setting, or None."""
     value = row.values[name] if name in row.values else lookup(row.config, _SETTINGS.get(name, name))
     return None if value != value or isinstance(value, dict) else value
 
 
 def _comparable(column: pd.Series) -> pd.Series:
-    """Return the sort key of a column: numbers and numeric text by value, others as text."""
+    """Return the sort key of a value: numbers and numeric strings by value, others as strings."""
     numbers = pd.to_numeric(column, errors="coerce")
     return numbers if (numbers.notna() | column.isna()).all() else column.map(str, na_action="ignore")

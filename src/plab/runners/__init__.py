@@ -1,4 +1,4 @@
-"""Runners: one per family of methods; each turns configurations into result files.
+"""Runners, one per family of methods, which turn configurations into result files.
 
 The file of a method contains the dataclass of its keys, its runner and its record, registered in
 :data:`plab.config.families.FAMILIES`. Runs are executed in batches; a single run is a batch of one.
@@ -45,17 +45,17 @@ __all__ = [
 
 
 def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
-    """Run one configuration, unless its result exists.
+    """Run one configuration unless its result exists.
 
     Args:
         cfg: The composed and checked configuration.
-        cache: Simulators of earlier runs; None: a new one.
+        cache: Simulators of earlier runs; default: a new cache.
 
     Returns:
         The run's score under its protocol, in [0, 1].
 
     Raises:
-        ResultsError: If the results folder cannot be written, or another process computes the run.
+        ResultsError: If the results folder cannot be written, or another process is computing the run.
         RunError: If the run failed; its results so far are kept in the partial file.
     """
     track = Track(cfg, RunFile(cfg))
@@ -68,14 +68,14 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
 
 
 def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
-    """Run configurations that fit together; see :func:`plab.sweep.running.plan`.
+    """Run configurations that can share a batch; see :func:`plab.sweep.running.plan`.
 
     Finished runs, and runs in progress in another process, are skipped.
 
     Args:
         cfgs: The composed and checked configurations.
-        note: Progress of the sweep, shown before that of the batch.
-        cache: Simulators of earlier batches; None: a new one.
+        note: Progress of the sweep, shown before the progress of the batch.
+        cache: Simulators of earlier batches; default: a new cache.
 
     Returns:
         Outcome of each run, in the order of ``cfgs``.
@@ -101,8 +101,8 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
 
 def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -> None:
-    """Execute unfinished tracks of one family; afterwards each has finished or has an error, and its lock is
-    released."""
+    """Execute unfinished tracks of one family; afterwards each has finished or has an error, and has released
+    its lock."""
     party = [track for track in tracks if track.open]
     parties, cache = [party] if party else [], cache or SimulatorCache()
     try:

@@ -1,4 +1,4 @@
-"""Base of ``sac``, ``td3`` and ``ppo``: one or many agents trained in lockstep.
+"""Base of ``sac``, ``td3`` and ``ppo``: one or more agents trained in lockstep.
 
 Agents share only kernel launches: their parameters are stacked, [agent, ...], for batched products. Each
 agent has its own environments, replay buffer, statistics and random numbers, starts with Stable-Baselines3's
@@ -38,10 +38,10 @@ class RlConfig(PolicyConfig):
     """Keys of all reinforcement-learning methods.
 
     Attributes:
-        profile: Profile with the default values; None: there are no profiles.
+        profile: Profile with the default values; None without profiles.
         num_envs: Environments simulated together.
         gamma: Discount factor.
-        profiles: Values by profile. Empty in the configuration of a run, whose fields have the values.
+        profiles: Values by profile. Empty in a run's configuration, whose fields have the values.
     """
 
     profile: str | None
@@ -79,7 +79,7 @@ class AgentRandom:
     """Independent random number generators of K agents on a device."""
 
     BLOCK = 50
-    """Entries drawn at once by :meth:`block`."""
+    """Number of entries sampled at once by :meth:`block`."""
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
         """Seed a generator per agent."""
@@ -88,8 +88,8 @@ class AgentRandom:
         self._rest: dict[str, list[Tensor]] = {}
 
     def draw(self, kind: str, *shape: int) -> Tensor:
-        """Draw numbers, shape [agent, *shape]: ``normal`` ones, ``uniform`` ones in [-1, 1), ``integers`` in
-        [0, :data:`LARGEST`), or a ``permutation`` of those below the only entry of ``shape``."""
+        """Sample numbers, shape [agent, *shape]: ``normal``, ``uniform`` in [-1, 1), ``integers`` in [0,
+        :data:`LARGEST`), or a ``permutation`` of the integers below the only entry of ``shape``."""
         drawn = []
         for generator in self._generators:
             options: dict[str, Any] = {"generator": generator, "device": self._device}
@@ -105,18 +105,19 @@ class AgentRandom:
 
     def block(self, use: str, kind: str, *shape: int) -> Tensor:
         """Return the next entry, shape [agent, *shape], of a named block of random numbers, which is refilled
-        when used up."""
+        when exhausted."""
         if not self._rest.get(use):
             self._rest[use] = list(self.draw(kind, self.BLOCK, *shape).unbind(1))[::-1]
         return self._rest[use].pop()
 
     def states(self) -> list[np.ndarray]:
-        """Return the state of each generator, and drop the blocks, because a resumed process has none."""
+        """Return the state of each generator, and drop the blocks, because a resumed process starts without
+        them."""
         self._rest = {}
         return [generator.get_state().numpy() for generator in self._generators]
 
     def restore(self, agent: int, state: np.ndarray) -> None:
-        """Restore an agent's generator from one of :meth:`states`."""
+        """Restore an agent's generator from a state returned by :meth:`states`."""
         self._generators[agent].set_state(torch.from_numpy(np.array(state, np.uint8)))
 
 
@@ -124,8 +125,7 @@ class AgentRandom:
 
 
 class Sizes(NamedTuple):
-    """Sizes of an agent's episodes: environments N, steps T, entries of an observation, components of an
-    action."""
+    """Sizes of an agent's episodes: environments N, steps T, observation entries and action components."""
 
     envs: int
     horizon: int
@@ -138,12 +138,12 @@ class Sizes(NamedTuple):
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def window(self, buffer_size: int) -> int:
-        """Return the number of latest steps of N environments that can be sampled, given the number of
+        """Return how many of the latest steps of N environments can be sampled, given the number of
         transitions."""
         return max(buffer_size // self.envs, 1)
 
     def capacity(self, buffer_size: int, total_steps: int) -> int:
-        """Return the number of episodes of N environments in a buffer, given the number of training
+        """Return how many episodes of N environments a buffer holds, given the number of training
         transitions."""
         # One more, because the oldest samples may begin, and the latest end, within an episode.
         held = math.ceil(self.window(buffer_size) / self.horizon) + 1
@@ -226,7 +226,7 @@ class ReplayBuffer:
 
     def write(self, agent: int, path: Path) -> None:
         """Append an agent's new episodes to its file, so that the file covers every checkpoint; raise
-        ResultsError if that fails."""
+        ResultsError on failure."""
         since, last = self._written[agent], self.added // self._sizes.horizon
         try:
             with path.open("r+b" if since else "wb") as file:
@@ -239,8 +239,8 @@ class ReplayBuffer:
         self._written[agent] = last
 
     def read(self, agent: int, path: Path, steps: int) -> None:
-        """Load whole episodes of N environments from an agent's file, given the number of transitions, the
-        same for all agents; raise ResultsError if that fails."""
+        """Load whole episodes of N environments from an agent's file, given the number of transitions, which
+        is equal for all agents; raise ResultsError on failure."""
         added = steps // self._sizes.envs
         self._count_to(added)
         self._written[agent] = last = added // self._sizes.horizon
@@ -254,11 +254,11 @@ class ReplayBuffer:
                         part.copy_(torch.from_numpy(numbers).view(part.shape))
         except (OSError, RuntimeError) as error:
             # The file is missing or shorter than required by the checkpoint.
-            remedy = "start afresh with force=true"
+            remedy = "start again with force=true"
             raise ResultsError(f"cannot read the replay buffer {path}: {error}; {remedy}") from error
 
     def _parts(self, agent: int, episode: int) -> list[Tensor]:
-        """Return an episode's places in the buffers, in file order."""
+        """Return the locations of an episode in the buffers, in file order."""
         tables = self._observations, self._actions, self._rewards
         return [table[agent, episode % self._capacity] for table in tables]
 
@@ -273,7 +273,8 @@ out], to avoid transposing products and gradients."""
 def stacked(
     policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
 ) -> dict[str, Part]:
-    """Return stacked parameters of policies of one kind by part: a module, or several of the same shape.
+    """Return the stacked parameters of policies of one kind, by part: a module, or several modules of the
+    same shape.
 
     Modules that are evaluated together, such as two critics, form one part; its stack has the modules of the
     first policy, then those of the second, etc.
@@ -308,8 +309,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 def mlp(x: Tensor, part: Part, name: str, activation: Callable[[Tensor], Tensor], *, last: bool) -> Tensor:
     """Evaluate a stacked ``nn.Sequential`` of linear layers for x of shape [stack, row, in]. ``name`` is its
-    name in the part, empty if it is the part itself. Each layer is followed by an activation, except the last
-    one if ``last``."""
+    name in the part, or empty if it is the whole part. An activation follows each layer, except the last
+    one unless ``last``."""
     prefix = f"{name}." if name else ""
     numbers = [int(n[len(prefix) : -len(".weight")]) for n in part if n.startswith(prefix) and "weight" in n]
     for number in sorted(numbers):
@@ -319,14 +320,14 @@ def mlp(x: Tensor, part: Part, name: str, activation: Callable[[Tensor], Tensor]
 
 
 def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
-    """Return the values that two stacked critics give, shape [agent, 2, row]."""
+    """Return the values of two stacked critics, shape [agent, 2, row]."""
     pairs = torch.cat([observations, actions], dim=2).repeat_interleave(2, dim=0)
     return mlp(pairs, part, "", torch.relu, last=True).view(len(observations), 2, -1)
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
-    """Return Adam for stacked parameters, with its state allocated in advance; one step updates all agents,
-    and can be captured on CUDA."""
+    """Return Adam for stacked parameters, with preallocated state; one step updates all agents and can be
+    captured on CUDA."""
     cuda, device = parameters[0].is_cuda, parameters[0].device
     rate: Any = torch.tensor(lr, device=device) if cuda else lr
     optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda, **options)
@@ -337,8 +338,8 @@ def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
 
 
 def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> None:
-    """Make one step of an optimiser on the independent losses of the agents, shape [agent]; the gradient of
-    each agent is clipped to the norm ``longest``."""
+    """Make an optimiser step on the independent losses of the agents, shape [agent], with each agent's
+    gradient clipped to the norm ``longest``."""
     parameters = optimizer.param_groups[0]["params"]
     gradients = torch.autograd.grad(losses.sum(), parameters)
     if longest is not None:
@@ -347,26 +348,26 @@ def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> No
         scale = (longest / (norms + 1e-6)).clamp(max=1.0)
         gradients = tuple((g.reshape(agents, -1) * scale.unsqueeze(1)).reshape(g.shape) for g in gradients)
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        # A step of all at once takes the numbers as they lie in memory.
+        # A joint step reads the numbers in memory order.
         parameter.grad = gradient.contiguous()
     optimizer.step()
 
 
 def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
-    """Update targets: target <- (1 - tau) target + tau source."""
+    """Update target networks: target <- (1 - tau) target + tau source."""
     with torch.no_grad():
         torch._foreach_lerp_(targets, sources, tau)
 
 
 WARM_UP = 3
-"""Number of updates before graph capture, in which libraries and optimisers allocate memory."""
+"""Number of updates before graph capture, during which libraries and optimisers allocate memory."""
 
 
 class CapturedUpdate:
     """An update of a model; on CUDA it is captured once per shape of its arguments and then replayed.
 
-    The function may change parameters and optimisers in place, and may draw random numbers of the device. It
-    must not synchronise with the device, and all data besides its arguments must keep their addresses.
+    The function may change parameters and optimisers in place, and may sample random numbers on the device.
+    It must not synchronise with the device, and all data except its arguments must keep their addresses.
     """
 
     def __init__(self, update: Callable[..., Tensor]) -> None:
@@ -377,7 +378,7 @@ class CapturedUpdate:
         self._calls = 0
 
     def __call__(self, *arguments: Tensor) -> Tensor:
-        """Update; the next call overwrites the returned tensor."""
+        """Make an update; the next call overwrites the returned tensor."""
         if not arguments[0].is_cuda:
             return self._update(*arguments)
         self._calls += 1
@@ -408,12 +409,12 @@ class Agents:
     """K agents trained in lockstep; each is equivalent to a single agent.
 
     Attributes:
-        sizes: Sizes of their episodes.
+        sizes: Sizes of the episodes.
         steps: Number of transitions per agent so far.
         updates: Number of updates per agent so far.
-        networks: Their parameters by part.
+        networks: Parameters by part.
         optimizers: Adam optimisers of parts of the networks, by name.
-        tensors: Further tensors of a checkpoint, by name, each of shape [agent, ...].
+        tensors: Additional tensors of a checkpoint, by name, each of shape [agent, ...].
         watched: Whether losses are recorded for :meth:`take_losses`.
     """
 
@@ -427,8 +428,7 @@ class Agents:
     watched = False
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Initialise untrained networks for configurations, one per agent, with the same section
-        ``method``."""
+        """Initialise untrained networks for configurations with equal ``method`` sections, one per agent."""
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
         first = [first_policy(cfg.method_as(RlConfig), spaces, cfg.seed) for cfg in cfgs]
@@ -461,7 +461,7 @@ class Agents:
         return policy, None
 
     def parameters(self, *parts: str) -> list[Tensor]:
-        """Return the stacked parameters of some parts; of all if none is named."""
+        """Return the stacked parameters of the named parts, or of all parts."""
         return [tensor for part in parts or self.networks for tensor in self.networks[part].values()]
 
     @classmethod
@@ -479,12 +479,12 @@ class Agents:
 
     @abstractmethod
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the deterministic policy's actions, shape [agent, row, action], in [-1, 1]."""
+        """Return the actions of the deterministic policy, shape [agent, row, action], in [-1, 1]."""
 
     @abstractmethod
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
         """Process the results of the latest actions: rewards, shape [agent, env], and next observations,
-        shape [agent, env, entry]; make the updates that are due. The next step starts from ``observations``,
+        shape [agent, env, entry]; make all pending updates. The next step starts from ``observations``,
         which differ from the last ones if the episodes are ``over``."""
 
     def _tables(self) -> dict[str, list[Tensor]]:
@@ -509,8 +509,8 @@ class Agents:
         ]
 
     def restore(self, agent: int, state: Mapping[str, Any]) -> None:
-        """Restore an agent from one of :meth:`states`; the others must be restored to the same step. Raise
-        RuntimeError if it belongs to another agent."""
+        """Restore an agent from a state returned by :meth:`states`; the other agents must be restored to the
+        same step. Raise RuntimeError if the state does not fit."""
         for name, tensors in self._tables().items():
             own = [tensor.detach().view(self.count, -1)[agent] for tensor in tensors]
             numbers = torch.from_numpy(state[name]).split([part.numel() for part in own])
@@ -523,7 +523,7 @@ class Agents:
         self.draws.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
-        """Return each agent's losses by name, means over the updates since the last call."""
+        """Return each agent's mean losses since the last call, by name."""
         means = {name: torch.stack(rows).mean(0).tolist() for name, rows in self._losses.items()}
         self._losses = {}
         return [{name: row[agent] for name, row in means.items()} for agent in range(self.count)]
@@ -558,7 +558,7 @@ class OffPolicyAgents(Agents):
         """Make one update."""
 
     def act(self, observations: Tensor) -> Tensor:
-        """Return random actions initially, and later those of the policy with noise."""
+        """Return random actions initially, and noisy actions of the policy later."""
         self._observations = observations
         if self.steps < self.method.learning_starts:
             shape = self.sizes.envs, self.sizes.actions
@@ -568,15 +568,15 @@ class OffPolicyAgents(Agents):
         return self._actions
 
     def noise(self) -> Tensor:
-        """Draw standard normal noise of the environments' actions, shape [agent, env, action]."""
+        """Sample standard normal noise for the environments' actions, shape [agent, env, action]."""
         return self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
 
     def numbers(self) -> Tensor:
-        """Draw the indices of an update's transitions, shape [agent, row]."""
+        """Sample the indices of an update's transitions, shape [agent, row]."""
         return self.draws.block("numbers", "integers", self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
-        """Return the actions used before learning starts, given uniformly random ones."""
+        """Return the actions used before learning starts, given uniformly random actions."""
         return actions
 
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:

@@ -1,4 +1,4 @@
-"""A policy network trained through the simulator's gradient: ``apg``, analytic policy gradient.
+"""Analytic policy gradient (``apg``): a policy network trained through the simulator's gradient.
 
 Each iteration simulates an episode of the policy, and backpropagates through its states, observations and
 actions. To reproduce a result:
@@ -29,7 +29,7 @@ class ApgConfig(MethodConfig):
 
     Attributes:
         lr: Learning rate of Adam.
-        iterations: Rollouts with gradient, hence updates.
+        iterations: Number of rollouts with gradient, equal to the number of updates.
         hidden: Widths of the hidden layers.
         torch_threads: CPU threads of torch.
     """

@@ -1,4 +1,4 @@
-"""Behaviour cloning: ``bc``, a policy that learns the actions of a dataset from its observations.
+"""Behaviour cloning (``bc``): a policy that learns the actions of a dataset from its observations.
 
 Datasets are written by ``plab dataset`` or Minari. To reproduce a result:
 
@@ -33,7 +33,8 @@ class BcConfig(PolicyConfig):
         demonstrations: Maximum number of episodes of the dataset to learn from; None: all.
         episodes: Training episodes in total, counting each pass over the dataset; rounded up to whole passes.
         batch_size: Actions per update of the policy.
-        observation_noise: Standard deviation of noise on the observations, in units of theirs.
+        observation_noise: Standard deviation of the noise on observations, relative to their standard
+            deviation.
         shift: Largest common shift of all observed positions along x and along z [domain units].
     """
 
@@ -45,7 +46,7 @@ class BcConfig(PolicyConfig):
 
 
 class ImitationRunner(ActorRunner):
-    """Base of runners of a policy that learns actions (mean squared error) from augmented observations."""
+    """Base of runners whose policy learns actions (mean squared error) from augmented observations."""
 
     def prepare(self, batch: EpisodeBatch) -> None:
         from plab.envs.observations import level_entries
@@ -81,7 +82,7 @@ class BcRunner(ImitationRunner):
     simulates = False
 
     def prepare(self, batch: EpisodeBatch) -> None:
-        """Begin with the observations and actions of the dataset."""
+        """Load the observations and actions of the dataset."""
         super().prepare(batch)
         data = pairs(self.method, self._spaces)
         self.tracks[0].run.result.provenance["dataset_rows"] = len(data[0])
@@ -95,7 +96,7 @@ class BcRunner(ImitationRunner):
         return []
 
     def learn(self, rate_left: float) -> None:
-        """Make one pass over the data, at a fraction of the learning rate."""
+        """Make one pass over the data, with the given fraction of the learning rate."""
         set_rate(self._optimizer, self.method.lr * rate_left)
         count = math.ceil(len(self._seen) / self.method.batch_size)
         self.note(imitation_error=np.array([self.imitate(self._seen, self._wanted, count)]))

@@ -25,8 +25,7 @@ POINTS = 256
 """Number of points of the body and of the target."""
 
 ALIGNMENTS = 10
-"""Number of assignments for several bodies, each after moving them by their mean displacements; later ones
-converge."""
+"""Number of assignments for several bodies; each moves the bodies by their mean displacements."""
 
 TUBE = 0.04
 """Half width of the swept path in which a manipulator is assumed to make contact [domain units]."""
@@ -45,7 +44,7 @@ OVERSHOOT = (0.5, 1.5)
 
 
 class ContactStarts:
-    """Starts for a scene and its target."""
+    """Initial action sequences for a scene and its target."""
 
     def __init__(self, scene: Scene, target: np.ndarray) -> None:
         """Store the scene and the target's mass tensor, shape [n, n, n]."""
@@ -60,8 +59,8 @@ class ContactStarts:
         )
 
     def _with_joints(self, own: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Append the actions of the articulated model, if any: two uniform motions of all joints; in the
-        second, a movable base follows the mean displacement of the bodies."""
+        """Append the actions of the articulated model, if any: two uniform motions of all joints. In the
+        second motion, a movable base follows the mean displacement of the bodies."""
         chain, steps = self._scene.kinematics, self._scene.horizon
         if chain is None:
             return own
@@ -78,8 +77,8 @@ class ContactStarts:
 
     @cached_property
     def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points of the bodies, shape [point, 3], their displacements, likewise, and the numbers of their
-        bodies."""
+        """Return points of the bodies, shape [point, 3], their displacements, same shape, and the indices of
+        their bodies."""
         scene = self._scene
         body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
         # Distributed evenly over particles and mass, so that all bodies and parts of the target are
@@ -129,7 +128,7 @@ class ContactStarts:
         together = max(map(len, tracks), default=0)
         # Manipulators that hold a body between them must move at the same speed.
         left = max(2, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
-        # Every second time over other bodies.
+        # Every second path leads over other bodies.
         rise = rng.uniform(*ARCH) if len(self._scene.bodies) > 1 and rng.integers(2) else 0.0
         arch = np.array([0.0, rise, 0.0])
         for track, tool in zip(tracks, self._tools, strict=True):
@@ -140,19 +139,19 @@ class ContactStarts:
         return self._actions(tracks)
 
     def _owner(self, tool: Manipulator) -> int:
-        """Return the number of the body with the centre nearest to a manipulator."""
+        """Return the index of the body with the centre nearest to a manipulator."""
         centres = np.array([body.center for body in self._scene.bodies])
         return int(np.linalg.norm(centres - np.asarray(tool.position), axis=1).argmin())
 
     def _to_touch(
         self, tool: Manipulator, points: np.ndarray, point: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """Return the displacement of a manipulator to its contact with a body, given by points, when
+        """Return the displacement of a manipulator up to contact with a body, given by points, when
         approaching one of them along a direction."""
         along = (points - point) @ direction
         aside = np.linalg.norm(points - point - along[:, None] * direction, axis=1)
         met = point + along[aside < TUBE].min(initial=0.0) * direction
-        # Manipulators that carry between their parts, such as chopsticks, have no extent.
+        # Manipulators that grip between their parts, such as chopsticks, have no extent.
         own, reach = _rotation(tool).inv().apply(direction), tool.kind.support
         extent = 0.0 if reach is None else float(reach(tool.size, own))
         place = np.clip(met - extent * direction, tool.lower_bound, tool.upper_bound)
@@ -165,8 +164,8 @@ class ContactStarts:
 
 
 def _middle_ways(ways: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """Return the displacement of each body, shape [body, 3], as a median, because some of its points may be
-    assigned elsewhere."""
+    """Return the median displacement of each body, shape [body, 3], because some of its points may be
+    assigned to other bodies' targets."""
     return np.stack([np.median(ways[body == b], axis=0) for b in np.unique(body)])
 
 

@@ -1,4 +1,4 @@
-"""System identification: ``identify`` fits material, friction and gravity to observed particles.
+"""System identification (``identify``): a fit of material, friction and gravity to observed particles.
 
 Gauss-Newton method with Levenberg's damping on the particle positions of an episode of a dataset. Derivatives
 are central differences, with all simulations in one batch. The standard deviations are from Laplace's
@@ -42,8 +42,8 @@ class IdentifyConfig(MethodConfig):
 
     Attributes:
         dataset: Folder of a dataset of this task and variant; the observation is ``state`` or ``particles``.
-        episode: Number of its episode that is fitted.
-        parameters: Fitted parameters, out of :data:`PARAMETERS`; the others are the task's.
+        episode: Number of the fitted episode.
+        parameters: Fitted parameters, from :data:`PARAMETERS`; the others are the task's.
         iterations: Number of Gauss-Newton steps.
         difference: Relative change of a parameter for central differences.
         damping: Initial damping, relative to the curvature.
@@ -69,7 +69,7 @@ class IdentifyRunner(Runner):
     improved the fit.
 
     A row has the best parameters so far, their standard deviations, and the RMS distance of the particles
-    from their observed positions. Actions and scores are the episode's.
+    from their observed positions. Actions and scores are those of the episode.
     """
 
     def build(self) -> None:
@@ -90,7 +90,7 @@ class IdentifyRunner(Runner):
         count = len(range(0, scene.particle_count, self._stride))
         shape, wanted = self._actions.shape, (scene.horizon, scene.action_dim)
         if shape != wanted or seen.reshape(len(seen), -1).shape[1] < 3 * count:
-            why = "is of another scene or observation: use its task, sim and observe_particles"
+            why = "has another scene or observation: use its task, sim and observe_particles"
             raise ConfigError(f"method.dataset={method.dataset} {why}")
         rows = seen if seen.ndim == 3 else seen[:, : 6 * count].reshape(len(seen), count, 6)
         self._observed = rows[1:, :, :3].astype(np.float64)
@@ -128,7 +128,7 @@ class IdentifyRunner(Runner):
         state["trial"] = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
         variance = state["cost"] / max(residual.size - len(changes), 1)
         deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
-        # Parameters without any effect, such as the friction of a floor that bodies stick to.
+        # Parameters without effect, such as floor friction while bodies stick.
         deviations[np.diag(state["curvature"]) == 0.0] = np.nan
         found = dict.fromkeys(FAMILY.columns, np.nan)
         found["misfit"] = float(np.sqrt(3.0 * state["cost"] / residual.size))

@@ -1,4 +1,4 @@
-"""Model-predictive control: ``mpc`` plans some steps ahead, takes the first of them, and plans again.
+"""Model-predictive control (``mpc``): planning over a window, execution of the first steps, and replanning.
 
 Any planner or gradient method can plan from the current state; its keys are in the section
 ``method.planner``. Each plan is initialised with the remainder of the previous one. To reproduce a result:
@@ -108,7 +108,7 @@ class MpcRunner(PlannerRunner):
         self._beginning = self._current_state()
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Begin the episode, or repeat the steps in the file."""
+        """Begin the episode, or repeat the steps stored in the file."""
         self._executed = np.zeros((0, self.problem.scenes[0].action_dim))
         self._found: Tensor | None = None
         self._terms: list[np.ndarray] = []
@@ -173,7 +173,8 @@ class MpcRunner(PlannerRunner):
             self.problem.simulator.set_initial_state(self._beginning)
 
     def _execute(self, actions: np.ndarray) -> None:
-        """Execute actions of shape [k, A] in the hard contact model, and plan from the resulting state."""
+        """Execute actions, shape [k, A], in the hard contact model, and use the resulting state for the next
+        plan."""
         simulator = self.problem.simulator
         simulator.set_contact("hard")
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)
@@ -182,14 +183,14 @@ class MpcRunner(PlannerRunner):
         self.problem.simulator.set_initial_state(self._current_state())
 
     def _current_state(self) -> State:
-        """Return the state of the first environment, for all of them."""
+        """Return the state of the first environment, repeated for all environments."""
         state = self.problem.simulator.state()
         arrays = {name: own for name, own in vars(state).items() if own is not None}
         return replace(state, **{name: np.repeat(own[:1], len(own), axis=0) for name, own in arrays.items()})
 
 
 FAMILY = Family(
-    label="actions of plans that are made anew every few steps",
+    label="actions of plans that are updated every few steps",
     config=MpcConfig,
     runner=MpcRunner,
     ranking="score",

@@ -1,4 +1,4 @@
-"""Base of planners: keys, evaluation of candidates, starts, stages, and the runner.
+"""Base of planners: keys, evaluation of candidates, starts, stages and the runner.
 
 A planner is a generator that yields candidates and receives their evaluation; the runner evaluates the
 candidates of all runs of a batch together. Candidates, losses, scores and gradients are tensors on the
@@ -40,8 +40,8 @@ class PlannerConfig(MethodConfig):
         algorithm: Search algorithm, one of the family's rules.
         iterations: Rows of the result; the cost of a row depends on the planner.
         population: Number of candidates, each an action sequence.
-        objective: Ranking of candidates: ``loss``, that of the whole episode; ``final``, that of its
-            last step; or ``score``, and the loss where the score is 0.
+        objective: Criterion for ranking candidates: ``loss`` of the whole episode; ``final``, the loss of the
+            last step; or ``score``, with the loss if the score is 0.
         action_init: Half width of the uniform distribution of random candidates.
         contact_starts: Fraction of the initial candidates that move manipulators to the body and push or
             carry it towards the target; the others are random.
@@ -57,12 +57,12 @@ class PlannerConfig(MethodConfig):
 
 @dataclass(frozen=True)
 class Request:
-    """Candidates to be tried.
+    """Candidates to be evaluated.
 
     Attributes:
         actions: Actions in [-1, 1], shape [P, T, A].
-        softness: Decay rate of the soft contact [1 / domain unit]; None: the hard one.
-        gradient: Request their gradient.
+        softness: Decay rate of the soft contact model [1 / domain unit]; None: hard contact.
+        gradient: Whether gradients are requested.
     """
 
     actions: Tensor
@@ -72,13 +72,13 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """Results of candidates.
+    """Evaluation of candidates.
 
     Attributes:
         measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
         final_loss: Loss of the last step, shape [P].
         gradient: Gradient of ``loss``, shape [P, T, A], 0 for diverged candidates; None if not requested.
-        broken: Diverged candidates, shape [P], bool; their numbers are meaningless.
+        broken: Diverged candidates, shape [P], bool; their values are meaningless.
     """
 
     measures: dict[str, Tensor]
@@ -128,10 +128,10 @@ class CandidateStart:
 
 
 class Planner(ABC):
-    """A run's search; subclasses define its start and an iteration.
+    """Search of one run; subclasses define its start and an iteration.
 
     Attributes:
-        method: Its section ``method``.
+        method: The ``method`` section.
         start: Source of the first candidates.
         memory: Tensors that the next iteration depends on.
         iteration: Number of the next iteration.
@@ -144,8 +144,8 @@ class Planner(ABC):
 
     @abstractmethod
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Create the first candidates, given those of the previous stage, best first, shape [N, T, A]; N is 0
-        in the first stage."""
+        """Create the first candidates, given the candidates of the previous stage, best first, shape [N, T,
+        A]; N is 0 in the first stage."""
 
     @abstractmethod
     def iterate(self, random: torch.Generator) -> Asking:
@@ -160,7 +160,7 @@ class Planner(ABC):
         return torch.cat([self.memory["champion"][None], self.candidates()])
 
     def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
-        """Make the next iteration; the first one may start from the result of the previous stage."""
+        """Make the next iteration; the first iteration may start from the result of the previous stage."""
         if self.iteration == 0:
             nothing = torch.empty((0, *self.start.shape), dtype=torch.float64, device=self.start.device)
             self.begin(random, nothing if found is None else found)
@@ -169,8 +169,7 @@ class Planner(ABC):
         return shown
 
     def show(self, actions: Tensor, answer: Answer) -> Shown:
-        """Return the best of some candidates and its measures, given their evaluation in the hard contact
-        model."""
+        """Return the best candidate and its measures, given an evaluation in the hard contact model."""
         cost = answer.cost("score")
         best = int(cost.argmin())
         if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
@@ -190,7 +189,7 @@ class Planner(ABC):
 
 
 def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
-    """Return the planner for a section ``method``: a single planner or stages."""
+    """Return the planner for a ``method`` section: a single planner or stages."""
     rule = family(method.family).rules[getattr(method, "algorithm")]  # noqa: B009
     return rule.what(method, start)
 
@@ -210,11 +209,11 @@ class StagesConfig(MethodConfig):
     def check(self, path: str) -> None:
         super().check(path)
         if not self.stages:
-            raise ConfigError(f"{path}.stages is empty: give one planner at least")
+            raise ConfigError(f"{path}.stages is empty: define at least one planner")
         for name, stage in self.stages.items():
             if not isinstance(stage, PlannerConfig):
                 raise ConfigError(
-                    f"{path}.stages.{name} is not a planner: start from one, as in conf/method/solve.yaml"
+                    f"{path}.stages.{name} is not a planner: use one, as in conf/method/solve.yaml"
                 )
             for part in ("loss_weights", "loss_terms"):
                 if getattr(stage, part) != getattr(self, part):
@@ -303,8 +302,9 @@ class PlannerRunner(Runner):
             yield track, step
 
     def drive(self, walks: Mapping[Track, Asking]) -> tuple[dict[Track, Shown], dict[Track, list[int]]]:
-        """Make iterations of planners, evaluating their candidates together; return best candidates and
-        measures of the runs that have not failed, and environment steps of all, without and with gradient."""
+        """Make iterations of planners, evaluating their candidates together; return the best candidates and
+        measures of the runs that have not failed, and the environment steps of all, without and with
+        gradient."""
         spent, shown = {track: [0, 0] for track in walks}, dict[Track, Shown]()
         pending = {track: next(walk) for track, walk in walks.items()}
         while pending:
@@ -322,7 +322,7 @@ class PlannerRunner(Runner):
         return shown, spent
 
     def judge(self, actions: np.ndarray) -> Episodes:
-        """Run the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
+        """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
         return super().judge(np.concatenate([actions] * self._width))
 
     def random(self, *key: int) -> torch.Generator:
@@ -331,11 +331,11 @@ class PlannerRunner(Runner):
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
-        """Evaluate candidates of some runs, the same number per run; runs whose candidates all diverge
-        fail."""
+        """Evaluate candidates of some runs, the same number per run; a run whose candidates all diverge
+        fails."""
         first, width = next(iter(requests.values())), self._width
         count, reasons = len(first.actions), dict[int, str]()
-        # By candidate and run; as many candidates as there are environments for are tried at once.
+        # Ordered by candidate and run; each batch fills all environments.
         size = count + -count % width, len(self.tracks), *first.actions.shape[1:]
         tried = torch.zeros(size, dtype=torch.float64, device=self._device)
         softness = np.zeros(len(self.tracks))
@@ -362,7 +362,7 @@ class PlannerRunner(Runner):
                 gradient = gradient.masked_fill(broken[:, None, None], 0.0)
             answers[track] = Answer(own, final, gradient, broken)
             if bool(broken.all()):
-                track.fail(f"none of {count} candidates came through; {reasons[track.number]}")
+                track.fail(f"all {count} candidates diverged; {reasons[track.number]}")
         return answers
 
 

@@ -1,4 +1,4 @@
-"""Policy optimization via differentiable simulation: ``pods``, a policy that imitates its own episodes,
+"""Policy optimization via differentiable simulation (``pods``): imitation of the policy's own episodes,
 improved by the simulator's gradient.
 
 After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates by Adam
@@ -36,9 +36,9 @@ class PodsConfig(ActorConfig):
     """Policy optimization via differentiable simulation.
 
     Attributes:
-        updates: Updates of the actions by their gradient in a round.
+        updates: Gradient updates of the actions per round.
         action_lr: Learning rate of the actions, in units of an action.
-        epochs: Training passes after a round, each over as many actions as the round has.
+        epochs: Training passes after a round, each over as many actions as a round has.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of the noise on observations, relative to their standard
             deviation.
@@ -80,7 +80,7 @@ class PodsRunner(ImitationRunner):
         improved = self._improved(actions, method.action_lr * rate_left)
         after, _ = self._episode(improved, "plan")
         if whole := [e for e in range(batch.size) if e not in self._failed]:
-            # Also in the states of its own episodes, so that deviations are corrected.
+            # Also imitate in the states of the policy's own episodes, so that deviations are corrected.
             seen = torch.cat([before[whole], after[whole]]).flatten(0, 1)
             wanted = torch.cat([improved[whole]] * 2).flatten(0, 1)
             self.statistics.update(seen.double().cpu().numpy())

@@ -1,4 +1,4 @@
-"""Trained policies: keys, settings of torch, and policy files.
+"""Trained policies: keys, torch settings and policy files.
 
 The file beside a result, ``<name>.policy.npz``, contains only arrays: the parameters of the networks by name,
 the bounds of observations and actions, and a JSON header with the section ``method`` of the run, from which
@@ -57,8 +57,8 @@ class PolicyConfig(MethodConfig):
     """Keys of methods that save their policy.
 
     Attributes:
-        algorithm: Learning algorithm, one of the family's.
-        episodes: Episodes of training.
+        algorithm: Learning algorithm of the family.
+        episodes: Number of training episodes.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
         torch_device: Device of the networks, ``cpu`` or ``cuda``.
         torch_threads: CPU threads of torch.
@@ -128,13 +128,13 @@ def packed(state: Mapping[str, Any]) -> np.ndarray:
 
 
 def unpacked(array: np.ndarray) -> dict[str, Any]:
-    """Return the argument of :func:`packed`, on the CPU, without executing anything."""
+    """Restore the argument of :func:`packed` on the CPU, without executing anything."""
     return torch.load(io.BytesIO(array.tobytes()), "cpu", weights_only=True)
 
 
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
-    """Return the initial policy of a training, created by ``make_policy(method, spaces)`` of the algorithm's
-    rule, on the CPU; the state of random generators is preserved."""
+    """Return the initial policy, created by ``make_policy(method, spaces)`` of the algorithm's rule, on the
+    CPU; the state of random generators is preserved."""
     rule = family(method.family).rules[method.algorithm].what
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -142,7 +142,7 @@ def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePol
 
 
 class Policy:
-    """A trained policy, deterministic.
+    """A trained, deterministic policy.
 
     Attributes:
         network: Stable-Baselines3's policy with the scaling of observations used in training.
@@ -169,8 +169,8 @@ def policy_path(result: Path) -> Path:
 def save_policy(
     result: Path, method: PolicyConfig, policy: BasePolicy, moments: Moments | None = None
 ) -> None:
-    """Write the policy file of a result, with the section ``method`` of its configuration and the moments
-    that scale observations, if any; raise ResultsError if that fails."""
+    """Write the policy file of a result, with the ``method`` section of its configuration and the moments
+    that scale observations, if any; raise ResultsError on failure."""
     arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
         space = cast("Box", getattr(policy, f"{name}_space"))
@@ -191,8 +191,8 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         device: Device of the network, ``cpu`` or ``cuda``.
 
     Raises:
-        ResultsError: If the policy is missing, its file is damaged, or the module of its family, outside
-            plab, has not been imported.
+        ResultsError: If the policy is missing, its file is damaged, or the external module of its family has
+            not been imported.
     """
     path = policy_path(Path(result))
     try:
@@ -203,7 +203,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
     except ResultsError:
         raise
     except Exception as error:
-        why = f"is not a policy of plab ({one_line(error)}): run it again with force=true"
+        why = f"is not a plab policy ({one_line(error)}): run it again with force=true"
         raise ResultsError(f"{path} {why}") from error
     # Errors of the device do not concern the file.
     policy.network = policy.network.to(device)
@@ -215,7 +215,7 @@ def _policy(path: Path) -> Policy:
     # NumPy's text may contain invalid characters.
     header = json.loads(str(arrays["header"][()]).encode())
     if header["format"] != _FORMAT:
-        raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
+        raise ValueError(f"it has the format {header['format']!r:.80}, not {_FORMAT!r}")
     method = _method(header["method"], path)
     from gymnasium.spaces import Box
 
@@ -233,11 +233,11 @@ def _policy(path: Path) -> Policy:
 
 
 def _method(section: Any, path: Path) -> PolicyConfig:
-    """Return the section ``method`` of a policy's header, with the type of its family."""
+    """Return the ``method`` section of a policy's header, with the type of its family."""
     name = str(section["family"])
     # A file must not determine imports.
     if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
-        raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} before")
+        raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} first")
     try:
         kind = family(name).config_type(section["algorithm"])
         method = cast(PolicyConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section)))
@@ -246,5 +246,5 @@ def _method(section: Any, path: Path) -> PolicyConfig:
         raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
         why = (error.msg or str(error)).splitlines()[0]
-        raise ValueError(f"its section method is invalid: {why}") from error
+        raise ValueError(f"its method section is invalid: {why}") from error
     return method

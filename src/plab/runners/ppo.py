@@ -1,4 +1,4 @@
-"""Proximal policy optimisation, many agents at once."""
+"""Proximal policy optimisation for one or more agents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PpoConfig(RlConfig):
     """Proximal policy optimisation.
 
     Attributes:
-        lr_decay: Decrease the learning rate linearly to 0 over the run.
+        lr_decay: Whether the learning rate decreases linearly to 0 over the run.
         steps_per_update: Transitions per update.
         minibatches: Minibatches of each epoch.
         epochs: Passes over the transitions of an update.
@@ -34,13 +34,13 @@ class PpoConfig(RlConfig):
         value_clip_range: Largest change of the value; None sets no limit.
         value_coefficient: Weight of the value function's mean squared error.
         entropy_coefficient: Weight of the policy's entropy.
-        entropy_mean: Use the mean of the entropies of an action's components instead of their sum.
+        entropy_mean: Whether to use the mean of the entropies of action components instead of their sum.
         max_gradient_norm: Largest norm of the gradient; larger gradients are scaled down.
-        adam_eps: Added to adam's denominator.
-        normalise: Scale observations and rewards by running statistics.
+        adam_eps: Epsilon in Adam's denominator.
+        normalise: Whether to scale observations and rewards by running statistics.
         statistics_episodes: Episodes after which the statistics of observations are frozen; None: never.
-        bootstrap: Bootstrap the value of an episode's last observation; otherwise the episode is treated as
-            terminated.
+        bootstrap: Whether to bootstrap the value of an episode's last observation; otherwise the episode is
+            treated as terminated.
         policy_gain: Gain of the initial orthogonal weights of the policy's last layer.
         value_gain: Gain of the value function's last layer.
     """
@@ -72,12 +72,12 @@ class PpoConfig(RlConfig):
 
 
 class Statistics:
-    """Running means and variances of many agents, as Stable-Baselines3's ``RunningMeanStd``, float64.
+    """Running means and variances of many agents in float64, as Stable-Baselines3's ``RunningMeanStd``.
 
     Attributes:
         mean: Shape [agent, ...].
         var: Shape [agent, ...].
-        count: Rows so far, shape [agent, 1].
+        count: Number of rows so far, shape [agent, 1].
     """
 
     def __init__(self, agents: int, *shape: int, device: torch.device) -> None:
@@ -157,7 +157,7 @@ class PpoAgents(Agents):
 
     @classmethod
     def cycle_steps(cls, method: PpoConfig, horizon: int) -> int:
-        """Return the transitions of an update."""
+        """Return the number of transitions per update."""
         return method.num_envs * math.ceil(method.steps_per_update / method.num_envs)
 
     def begin(self, observations: Tensor) -> None:
@@ -235,8 +235,8 @@ class PpoAgents(Agents):
         table["returns"].copy_(table["advantages"] + values)
 
     def minibatch(self, numbers: Tensor) -> Tensor:
-        """Update from a minibatch of the rollout: indices of transitions, by environment, then step, shape
-        [agent, row]; return the losses of policy, value and entropy, shape [3, agent]."""
+        """Update from a minibatch of the rollout, given the indices of transitions by environment, then step,
+        shape [agent, row]; return the losses of policy, value and entropy, shape [3, agent]."""
         m = self.method
         where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
         observations, actions = (
@@ -265,7 +265,7 @@ class PpoAgents(Agents):
         return torch.stack([part.detach() for part in (policy_loss, value_loss, entropy_loss)])
 
     def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means of actions, shape [agent, row, action], and values, shape [agent, row]."""
+        """Return mean actions, shape [agent, row, action], and values, shape [agent, row]."""
         pairs = observations.repeat_interleave(2, dim=0)
         latent = mlp(pairs, self.networks["hidden"], "", torch.tanh, last=False)
         latent = latent.view(self.count, 2, *latent.shape[1:])
@@ -278,7 +278,7 @@ class PpoAgents(Agents):
             return self._evaluate(self.scaled(observations))[1]
 
     def _log_prob(self, mean: Tensor, actions: Tensor) -> Tensor:
-        """Return logarithms of the densities of actions, shape [agent, row]."""
+        """Return the log densities of actions, shape [agent, row]."""
         log_std = self.networks["log_std"][""].unsqueeze(1)
         distance = ((actions - mean) / log_std.exp()).square()
         return (-0.5 * distance - log_std - 0.5 * math.log(2.0 * math.pi)).sum(2)

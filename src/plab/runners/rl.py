@@ -1,8 +1,8 @@
-"""Reinforcement learning: ``sac``, ``td3`` and ``ppo``, one agent or many at once.
+"""Reinforcement learning (``sac``, ``td3`` and ``ppo``) with one or more agents.
 
 Runs of a sweep with the same section ``method`` form a population: agents and their environments in one
 simulator, with one file each. A run alternates between training, for some episodes, and one episode of the
-deterministic policy, which gives a row of the results. To reproduce a result:
+deterministic policy, which produces a row of the results. To reproduce a result:
 
     python -m plab.run task=Torus variant=1 method=ppo seed=0
 """
@@ -37,7 +37,7 @@ def agents_of(method: RlConfig) -> type[Agents]:
 
 
 class RlRunner(PolicyRunner):
-    """Runner of a population: agents in lockstep, and their environments.
+    """Runner of a population of agents in lockstep, and of their environments.
 
     On CUDA the agents' parameters are stacked. On the CPU each agent is a separate stack: libraries select
     kernels by shape, so a joint stack would not be bitwise identical to a single agent.
@@ -129,7 +129,7 @@ class RlRunner(PolicyRunner):
         return stack.policy(number)
 
     def _first_observations(self) -> Tensor:
-        """Begin the first episodes, or replay those of the checkpoint to its step; return the
+        """Begin the first episodes, or replay the checkpoint's episodes up to its step; return the
         observations."""
         for stack in self.stacks:
             stack.watched = self.watched
@@ -171,7 +171,7 @@ class RlRunner(PolicyRunner):
         return done
 
     def _own(self, table: Tensor, envs: int) -> Tensor:
-        """Return a table of all environments by agent, shape [agent, env, entry or 1]."""
+        """Return a table of all environments, grouped by agent, shape [agent, env, entry or 1]."""
         return table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
 
     def _split(self, table: Tensor) -> list[Tensor]:

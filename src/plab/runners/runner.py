@@ -1,4 +1,5 @@
-"""Base of all runners, and runs of a batch: rows, best actions, times, progress, failures, outcomes and logs.
+"""Base class of all runners, and the runs of a batch: rows, best actions, times, progress, failures, outcomes
+and logs.
 
 A family of methods is a subclass of :class:`Runner`, with hooks for the start of a run, an iteration, and the
 state between iterations.
@@ -33,20 +34,20 @@ if TYPE_CHECKING:
 Kept = TypeVar("Kept")
 
 COLUMNS = ("loss", "reward", "iou", "score")
-"""Columns of the results common to all methods: measures of an episode besides the loss terms."""
+"""Result columns common to all methods: measures of an episode in addition to the loss terms."""
 
 FINAL_STATE_COLUMNS = ("iou", "score")
 """Columns that refer to the last state; the others are sums over the steps."""
 
 
 class RunError(PlabError, RuntimeError):
-    """A run has failed; the message has iteration and reason."""
+    """Failed run; the message has iteration and reason."""
 
     exit_code = 1
 
 
 class TogetherError(RuntimeError):
-    """Runs cannot be simulated together, because of the error's cause, or because one has failed and the
+    """Runs that cannot be simulated together, because of the error's cause, or because one has failed and the
     others must restart without it."""
 
 
@@ -65,7 +66,7 @@ class Step:
 
     Attributes:
         measures: Measures of the actions: :func:`plab.runners.runner.episode_columns`, and the columns of the
-            family. Others are left out.
+            family. Others are ignored.
         actions: Simulated actions, in [-1, 1], shape [T, A].
         state: State for the next iteration: nested dictionaries of arrays, numbers and strings.
         episodes: Episodes simulated before this iteration; None: one per iteration.
@@ -73,7 +74,7 @@ class Step:
         steps_forward: Environment steps simulated in this iteration without a gradient; default: those of one
             episode.
         steps_gradient: Environment steps simulated in this iteration with a gradient.
-        keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
+        keep: Whether to write the state to the file now, instead of every ``checkpoint_seconds``.
         whole: Whether the actions were simulated to the end; incomplete ones are never the best.
         best: New best actions, possibly of an earlier iteration, with this iteration and its loss; default:
             by the family's ranking.
@@ -104,7 +105,7 @@ class Track:
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
         contact: Contact model of the rows.
-        log: Log of rows and further numbers, selected by ``logger``.
+        log: Log of rows and other numbers, selected by ``logger``.
     """
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
@@ -143,8 +144,8 @@ class Track:
         return Outcome.of(self.cfg, "refused" if _is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
-        """Mark the run as failed because of an error, or a reason in the current iteration, also in its file,
-        which keeps the results so far. A run that is rejected before its first iteration leaves no file."""
+        """Mark the run as failed because of an error, or a reason in the current iteration. Its file keeps
+        the results so far; a run that is rejected before its first iteration leaves no file."""
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
         if isinstance(error, ResultsError) or (_is_refusal(error) and not self.run.advanced):
             # After a ResultsError nothing can be written to the file.
@@ -157,7 +158,7 @@ class Track:
 
     @contextmanager
     def results_errors(self) -> Iterator[None]:
-        """Fail if the block cannot read or write a file of the run."""
+        """Mark the run as failed if the block cannot read or write one of its files."""
         try:
             yield
         except ResultsError as error:
@@ -165,7 +166,7 @@ class Track:
 
     def record(self, step: Step, columns: Sequence[str], seconds: float) -> dict[str, float]:
         """Write an iteration, with the measures of some columns and the run's share of the wall time, to the
-        file and return its row; raise ResultsError if the file cannot be written."""
+        file, and return its row; raise ResultsError if the file cannot be written."""
         horizon, before = len(step.actions), sum(self._budget.values())
         episodes = before // horizon if step.episodes is None else step.episodes
         steps = episodes * horizon if step.steps is None else step.steps
@@ -175,7 +176,7 @@ class Track:
         row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
         row |= self._budget | {name: step.measures[name] for name in columns}
         row["seconds"] = seconds
-        # The first loss must beat NaN, which stands for none.
+        # The first loss replaces NaN, which stands for no loss.
         better = not row["loss"] >= self.best_loss
         # Among equal scores, the lowest loss wins.
         if self._by_score and row["score"] != self._best_score:
@@ -212,7 +213,7 @@ class Outcome:
         status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (invalid
             input), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
         score: Score of the final evaluation, NaN if there is none.
-        message: One-line reason why it has not finished.
+        message: One-line reason why the run has not finished.
     """
 
     title: str
@@ -233,10 +234,10 @@ class Outcome:
 
 
 def report(outcomes: Sequence[Outcome]) -> int:
-    """Print a summary line of a sweep, and a line on standard error per run without a result; return the exit
-    code: 0 if all results exist, 2 for invalid input, otherwise 1."""
+    """Print a summary line of a sweep, and one line on standard error per run without a result; return the
+    exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
     count = Counter(one.status for one in outcomes)
-    parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
+    parts = [f"{count['finished']} finished", f"{count['before']} finished earlier"]
     unfinished = ("failed", "refused", *_UNFINISHED)
     parts += [f"{count[status]} {_UNFINISHED.get(status, status)}" for status in unfinished if count[status]]
     print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)
@@ -250,7 +251,7 @@ def report(outcomes: Sequence[Outcome]) -> int:
 
 
 class Runner:
-    """Base of runners, which execute a batch of runs, resuming from their files.
+    """Base class of runners, which execute a batch of runs and resume them from their files.
 
     A family overrides :meth:`build`, :meth:`step` or :meth:`iterate`, and other hooks as needed. Order of
     calls: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any
@@ -268,7 +269,7 @@ class Runner:
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
         """Store the runs, a batch of :func:`plab.sweep.running.plan`, and a text shown before their progress;
-        nothing is built yet."""
+        build nothing yet."""
         self.tracks = list(tracks)
         for number, track in enumerate(tracks):
             track.number = number
@@ -296,7 +297,7 @@ class Runner:
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Make the next iteration of unfinished runs; by default :meth:`step` of each. Yield the successful
-        ones; mark failed ones with :meth:`Track.fail`. The wall time is shared equally."""
+        runs; mark failed ones with :meth:`Track.fail`. The wall time is shared equally."""
         for track in tracks:
             yield track, self.step(track)
 
@@ -312,16 +313,17 @@ class Runner:
         """Write additional files of a run, before the final evaluation."""
 
     def judge(self, actions: np.ndarray) -> Episodes:
-        """Run actions, shape [batch, T, A], in the hard contact model."""
+        """Simulate actions, shape [batch, T, A], in the hard contact model."""
         self.problem.simulator.set_contact("hard")
         return self.problem.rollout(actions, gradient=False, strict=False)
 
     def context(self) -> AbstractContextManager[Any]:
-        """Return a context for the whole batch, such as the threads of a library."""
+        """Return a context for the whole batch, such as thread settings of a library."""
         return nullcontext()
 
     def extent(self) -> tuple[int, int, int]:
-        """Return the progress: count done, total, and interval of reports without a terminal."""
+        """Return the progress: number of completed steps, total, and interval of reports without a
+        terminal."""
         total = max(self.iterations(track) for track in self.tracks)
         return min(track.iteration for track in self.tracks), total, PLAIN_EVERY
 
@@ -335,12 +337,12 @@ class Runner:
 
     @property
     def method(self) -> Any:
-        """Section ``method`` of the first run, shared by runs that train in lockstep."""
+        """``method`` section of the first run, shared by runs that train in lockstep."""
         return self.tracks[0].cfg.method
 
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
-        """Attribute the wall time from now on to another phase, and to other runs if given; an empty phase is
-        not counted."""
+        """Attribute the wall time from now on to another phase and, if given, to other runs; an empty phase
+        is not counted."""
         now = time.perf_counter()
         if self._phase:
             for track in self._timed:
@@ -423,9 +425,9 @@ class Runner:
         except Exception as error:
             if result.resume is None or isinstance(error, PlabError):
                 raise
-            # Of NumPy or torch, at a state of other arrays.
+            # Raised by NumPy or torch for a state with other arrays.
             reason, file = " ".join(str(error).split())[:300], track.run.partial_path
-            track.fail(ResultsError(f"{file} cannot be gone on from: {reason}; start afresh with force=true"))
+            track.fail(ResultsError(f"cannot resume from {file}: {reason}; start again with force=true"))
 
     def _conclude(self) -> None:
         """Evaluate the best actions in the hard contact model, and finish the files."""
@@ -473,7 +475,7 @@ class SimulatorCache:
 
     def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
         """Return the cached object of the last run if its key is equal and ``check`` does not raise
-        RuntimeError (its memory is invalid); otherwise a new one from ``build``."""
+        RuntimeError (its memory is invalid), otherwise a new object from ``build``."""
         # Other code may have restarted Taichi with another precision or device.
         with suppress(RuntimeError):
             if key in self._kept:
@@ -492,8 +494,8 @@ class SimulatorCache:
 
 
 def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
-    """Return the scalars of the final evaluation of one environment: those of :func:`episode_columns`, and
-    the IoUs behind the scores."""
+    """Return the scalars of one environment's final evaluation: :func:`episode_columns`, and the IoUs behind
+    the scores."""
     sums = zip(result.term_names, result.terms[environment].sum(axis=0), strict=True)
     judged = result.scores[environment]
     return {
@@ -535,8 +537,8 @@ def simulator_key(cfg: Config, scene: Scene) -> Hashable:
 
 @contextmanager
 def simulation_errors(when: str = "") -> Iterator[None]:
-    """Convert errors of the simulator into RunError, and those about insufficient memory into ConfigError;
-    ``when`` is prepended to the message."""
+    """Convert simulator errors to RunError, and errors about insufficient memory to ConfigError; ``when`` is
+    prepended to the message."""
     from plab.sim import DeviceError, SimulationError
 
     try:
@@ -550,7 +552,7 @@ def simulation_errors(when: str = "") -> Iterator[None]:
 # ------------------------------------------------------------------------------------------------------- logs
 
 PROJECT = "plab"
-"""Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
+"""Default project name at Weights & Biases; ``WANDB_PROJECT`` overrides it."""
 
 
 class RunLog:
@@ -568,8 +570,8 @@ class RunLog:
         self._close: Callable[[], object] = lambda: None
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers by name at an environment step, leaving out non-finite ones; raise ResultsError if that
-        fails."""
+        """Log numbers by name at an environment step, omitting non-finite ones; raise ResultsError on
+        failure."""
         if not self.wanted:
             return
         try:
@@ -590,7 +592,7 @@ class RunLog:
     def _tensorboard(self, steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
         """Open a TensorBoard event file in the folder ``<name>.tensorboard`` beside the result; TensorBoard
         hides entries of earlier processes after ``steps``."""
-        # Imported here, as below: it is optional.
+        # Imported here and below, because it is optional.
         from torch.utils.tensorboard.writer import SummaryWriter
 
         writer = SummaryWriter(str(self._run.path.with_suffix(".tensorboard")), purge_step=steps)
@@ -598,13 +600,13 @@ class RunLog:
         def write(values: Mapping[str, float], steps: int) -> None:
             for name, value in values.items():
                 writer.add_scalar(name, value, steps)
-            # So that they are visible immediately.
+            # Flush, so that entries are visible immediately.
             writer.flush()
 
         return write, writer.close
 
     def _wandb(self, _steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
-        """Start a run at Weights & Biases, or resume that of the same configuration. Its files are in the
+        """Start a run at Weights & Biases, or resume the run of the same configuration. Its files are in the
         folder ``wandb`` of ``results_dir``; ``WANDB_MODE`` and wandb's other environment variables apply."""
         import wandb
 

@@ -1,4 +1,4 @@
-"""Soft actor-critic with a learned entropy coefficient, many agents at once."""
+"""Soft actor-critic with a learned entropy coefficient, for one or more agents."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SacConfig(OffPolicyConfig):
 
 
 class SacAgents(OffPolicyAgents):
-    """Agents of soft actor-critic; targets are updated at every step."""
+    """Soft actor-critic agents; targets are updated at every step."""
 
     PARTS: ClassVar = {
         "actor": ("actor",),
@@ -88,9 +88,9 @@ class SacAgents(OffPolicyAgents):
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets from sampled transitions. ``numbers`` are
-        the integers of :meth:`plab.runners.agents.ReplayBuffer.sample`; the noises of actions and next
-        actions are standard normal, shape [agent, row, action]. Return coefficient and losses, shape [4,
-        agent]."""
+        the integers for :meth:`plab.runners.agents.ReplayBuffer.sample`; the noises of actions and next
+        actions are standard normal, shape [agent, row, action]. Return the coefficient and losses, shape
+        [4, agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         own_actions, log_prob = self._drawn(observations, noise)
@@ -114,7 +114,7 @@ class SacAgents(OffPolicyAgents):
         return torch.stack([loss.detach() for loss in losses])
 
     def _gaussian(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and logarithm of the standard deviation of actions before tanh."""
+        """Return the mean and log standard deviation of actions before tanh."""
         actor = self.networks["actor"]
         latent = mlp(observations, actor, "latent_pi", torch.relu, last=False)
         mean, log_std = (
@@ -123,7 +123,7 @@ class SacAgents(OffPolicyAgents):
         return mean, log_std.clamp(*LOG_STD)
 
     def _drawn(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions and the logarithms of their densities, shape [agent, row]."""
+        """Return sampled actions and their log densities, shape [agent, row]."""
         mean, log_std = self._gaussian(observations)
         plain = mean + log_std.exp() * noise
         actions = torch.tanh(plain)

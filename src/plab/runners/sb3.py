@@ -1,4 +1,4 @@
-"""Learning algorithms with the interface of Stable-Baselines3, such as those of sb3-contrib, as methods.
+"""Learning algorithms with the interface of Stable-Baselines3, such as those of sb3-contrib.
 
 plab's own ``sac``, ``td3`` and ``ppo`` are in :mod:`plab.runners.rl`. An external algorithm needs a record
 with ``replace(FAMILIES["sb3"], ...)`` and a :class:`ModelKind`; see docs/own_method.md. Checkpoints are
@@ -38,9 +38,9 @@ class ModelKind:
 
     Attributes:
         model: Class with the interface of Stable-Baselines3's algorithms.
-        arguments: Function of the section ``method`` and the environments that returns keyword arguments of
-            the class, ``policy_kwargs`` among them.
-        rollout_steps: Function of the section ``method`` that returns the number of steps of each environment
+        arguments: Function of the ``method`` section and the environments that returns keyword arguments of
+            the class, including ``policy_kwargs``.
+        rollout_steps: Function of the ``method`` section that returns the number of steps of each environment
             between updates, for on-policy algorithms; None for off-policy algorithms, which can pause after
             any episode.
     """
@@ -75,7 +75,7 @@ def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
 
 
 class Sb3Runner(PolicyRunner):
-    """Runner of a model, between episodes or, without a replay buffer, updates.
+    """Runner of a model; it pauses between episodes or, without a replay buffer, between updates.
 
     Attributes:
         model: The model.
@@ -139,7 +139,7 @@ class Sb3Runner(PolicyRunner):
         return [{name: np.frombuffer(part, np.uint8) for name, part in parts.items()}]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        # Episodes that were under way begin again.
+        # Interrupted episodes start again.
         self.model = self._kind.model.load(io.BytesIO(state["model"].tobytes()), self._env, self._device)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self._envs.next_episode = self.episodes // self._sizes.envs
@@ -162,7 +162,7 @@ class _Replay(LibraryBuffer):
     """Replay buffer with the library's interface, for episodes of equal length that end by truncation.
 
     Attributes:
-        kept: Its transitions.
+        kept: Stored transitions.
     """
 
     def __init__(

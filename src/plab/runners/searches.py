@@ -1,4 +1,4 @@
-"""Search algorithms of the planners.
+"""Search algorithms for planners.
 
 * ``multistart``: gradient descent (Adam) from many starts; the worse half is replaced at intervals.
 * ``cem``, cross-entropy method: sample curves from a normal distribution, fit it to the best, repeat.
@@ -6,7 +6,7 @@
   whole episode; with a deterministic simulator, replanning during the episode would gain nothing.
 * ``cmaes``: covariance matrix adaptation of a curve's points, by the library cmaes.
 
-The last three draw curves of actions and learn from their costs, without a gradient. To reproduce a result:
+The last three sample curves of actions and learn from their costs, without a gradient. To reproduce a result:
 
     python -m plab.run task=Move variant=1 method=cem seed=0
 """
@@ -41,11 +41,11 @@ class MultistartConfig(PlannerConfig):
         betas: Decay rates of Adam's two moment estimates.
         eps: Added to Adam's denominator.
         updates: Updates of each candidate per iteration.
-        softness_end: Final softness; it changes geometrically from ``softness`` over the iterations; None: it
-            stays.
+        softness_end: Final softness, approached geometrically from ``softness`` over the iterations; None:
+            constant softness.
         replace_every: Iterations after which the worse half is replaced.
-        fresh: Fraction of the replaced candidates with a new start; the others start near a better candidate,
-            within ``action_init``.
+        fresh: Fraction of the replaced candidates that get a new start; the others start near a better
+            candidate, within ``action_init``.
     """
 
     lrs: list[float]
@@ -59,11 +59,11 @@ class MultistartConfig(PlannerConfig):
     def check(self, path: str) -> None:
         super().check(path)
         if not self.lrs:
-            raise ConfigError(f"{path}.lrs is empty: give one learning rate at least")
+            raise ConfigError(f"{path}.lrs is empty: set at least one learning rate")
         for lr in self.lrs:
             ranges.positive(f"{path}.lrs", lr)
         if self.softness_end is not None and self.contact == "hard":
-            raise ConfigError(f"{path}.softness_end has no effect with contact=hard: leave it out")
+            raise ConfigError(f"{path}.softness_end has no effect with contact=hard: omit it")
 
 
 class Multistart(Planner):
@@ -101,7 +101,7 @@ class Multistart(Planner):
         return self.memory["actions"][self.memory["order"]]
 
     def _descend(self, gradient: Tensor) -> None:
-        """Make a step of Adam, as ``torch.optim.Adam``, with gradients of shape [P, T, A]."""
+        """Make an Adam step, as ``torch.optim.Adam`` does, with gradients of shape [P, T, A]."""
         memory, (first, second), lrs = self.memory, self.method.betas, self.method.lrs
         memory["updates"] = memory["updates"] + 1
         mean = memory["mean"] = torch.lerp(memory["mean"], gradient, 1 - first)
@@ -116,7 +116,7 @@ class Multistart(Planner):
         memory["actions"] = moved.clamp(-1.0, 1.0)
 
     def _replace(self, order: Tensor, random: torch.Generator) -> None:
-        """Replace the worse half of the candidates, some by new starts, some by neighbours of better ones."""
+        """Replace the worse half of the candidates by new starts and by neighbours of better candidates."""
         better, worse = order.tensor_split([(len(order) + 1) // 2])
         fresh = self.start.draw(self.method, round(self.method.fresh * len(worse)), random)
         beside = len(worse) - len(fresh)
@@ -156,8 +156,7 @@ def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
 
 
 def knots_of(actions: Tensor, knots: int) -> Tensor:
-    """Return points, shape [P, knots, A], as means of actions, shape [P, T, A], over their parts of the
-    episode."""
+    """Return points, shape [P, knots, A], as means of actions, shape [P, T, A], over parts of the episode."""
     return torch.nn.functional.adaptive_avg_pool1d(actions.transpose(1, 2), knots).transpose(1, 2)
 
 
@@ -173,7 +172,7 @@ class Sampler(Planner):
         return min(self.method.knots, self.start.shape[0])
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        # Half of the candidates are the best ones so far, the others are new starts.
+        # Half of the candidates are the best so far; the others are new starts.
         kept = found[: self.method.population // 2]
         drawn = self.start.draw(self.method, self.method.population - len(kept), random)
         self.memory["candidates"] = torch.cat([kept, drawn])
@@ -182,7 +181,7 @@ class Sampler(Planner):
         return self.memory["candidates"]
 
     def iterate(self, random: torch.Generator) -> Asking:
-        """Evaluate the starts, later the samples, and learn from them."""
+        """Evaluate the starts, then the samples, and learn from them."""
         method, first = self.method, self.iteration == 0
         if first:
             points = knots_of(self.memory["candidates"], self.knots)
@@ -211,7 +210,7 @@ class Sampler(Planner):
 
     @abstractmethod
     def sample(self, random: torch.Generator) -> Tensor:
-        """Sample curves, shape [P, K, A]; values outside [-1, 1] will be clipped."""
+        """Sample curves, shape [P, K, A]; values outside [-1, 1] are clipped later."""
 
     @abstractmethod
     def learn(self, points: Tensor, cost: Tensor) -> None:
@@ -219,7 +218,7 @@ class Sampler(Planner):
         candidates."""
 
     def noise(self, random: torch.Generator) -> Tensor:
-        """Draw standard normal numbers, shape [P, K, A]."""
+        """Sample standard normal numbers, shape [P, K, A]."""
         size = (self.method.population, self.knots, self.start.shape[1])
         return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
 
@@ -266,11 +265,11 @@ class Cem(Sampler):
 
 @dataclass
 class MppiConfig(SamplerConfig):
-    """Model-predictive path integral: the mean of all candidates, weighted by cost.
+    """Model-predictive path integral, in which the mean of all candidates is weighted by cost.
 
     Attributes:
-        temperature: Temperature: a candidate worse than the best by this many standard deviations of the
-            costs has 1 / e of its weight.
+        temperature: Number of standard deviations of the costs by which a candidate is worse than the best if
+            its weight is 1 / e of the best candidate's.
         decay: Factor of the standard deviation per iteration.
     """
 
@@ -339,7 +338,7 @@ class Cmaes(Sampler):
 
     def state(self) -> dict[str, Any]:
         held = self._search.__getstate__()
-        # Copies: the library modifies some arrays in place.
+        # Copy, because the library modifies some arrays in place.
         return super().state() | {"search": {name: np.array(v) for name, v in held.items() if v is not None}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -350,7 +349,7 @@ class Cmaes(Sampler):
 
 
 FAMILY = Family(
-    label="a sequence of actions, searched for with many candidates",
+    label="an action sequence, optimised by sampling many candidates",
     config=PlannerConfig,
     runner=PlannerRunner,
     ranking="score",

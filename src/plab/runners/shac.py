@@ -1,5 +1,5 @@
-"""Short-horizon actor-critic: ``shac``, a policy that learns from the simulator's gradient over a few steps
-and from a value function beyond them.
+"""Short-horizon actor-critic (``shac``): a policy trained by the simulator's gradient over a few steps and a
+value function beyond them.
 
 After Xu et al., Accelerated Policy Learning with Parallel Differentiable Simulation (ICLR 2022). Each episode
 is divided into windows. In each window actions are sampled from the policy. The gradient of the discounted
@@ -34,9 +34,9 @@ class ShacConfig(ActorConfig):
 
     Attributes:
         gamma: Discount factor.
-        window: Number of steps that the gradient is backpropagated through.
+        window: Number of steps of backpropagation.
         value_lr: Learning rate of the value function.
-        lr_decay: Decrease the learning rates linearly to 0 over the run.
+        lr_decay: Whether the learning rates decrease linearly to 0 over the run.
         td_lambda: Lambda of the value function's targets.
         tau: Update rate of the target value function at each window.
         value_epochs: Passes of the value function over a window.
@@ -71,15 +71,15 @@ class ShacRunner(ActorRunner):
 
     @staticmethod
     def make_policy(method: ShacConfig, spaces: Spaces) -> Any:
-        """Return the policy with which training begins, on the CPU. The standard deviation of the actions,
-        before the hyperbolic tangent, is learned and independent of the observation."""
+        """Return the initial policy, on the CPU. The standard deviation of the actions, before the hyperbolic
+        tangent, is learned and independent of the observation."""
         policy = actor_policy(spaces, method.hidden)
         deviation = torch.full(spaces.action_space.shape, math.log(method.noise))
         policy.log_std = torch.nn.Parameter(deviation)
         return policy
 
     def _draw(self, observations: torch.Tensor) -> torch.Tensor:
-        """Draw actions, shape [env, A], for observations, shape [env, entry]."""
+        """Sample actions, shape [env, A], for observations, shape [env, entry]."""
         # Without the hyperbolic tangent.
         mean = self.network.mu[:-1](self.scaled(observations))
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device, dtype=mean.dtype)
@@ -146,9 +146,9 @@ class ShacRunner(ActorRunner):
 
 
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:
-    """Return the TD(lambda) targets, shape [T, env], of a part of an unfinished episode, from rewards, shape
-    [T, env], and values before each step and after the last, shape [T + 1, env]. A ``decay`` (lambda) of 0
-    looks one step ahead, of 1 to the end."""
+    """Return the TD(lambda) targets, shape [T, env], of part of an unfinished episode, given rewards, shape
+    [T, env], and values before each step and after the last, shape [T + 1, env]. With ``decay`` (lambda) 0
+    they look one step ahead, with 1 to the end."""
     targets, ahead = [], values[-1]
     for reward, value in zip(rewards.flip(0), values[1:].flip(0), strict=True):
         ahead = reward + gamma * ((1.0 - decay) * value + decay * ahead)

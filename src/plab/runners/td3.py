@@ -1,4 +1,4 @@
-"""Twin delayed deep deterministic policy gradient, many agents at once."""
+"""Twin delayed deep deterministic policy gradient (TD3) for one or more agents."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Td3Config(OffPolicyConfig):
 
 
 class Td3Agents(OffPolicyAgents):
-    """TD3 agents; actor and targets are updated with every ``policy_delay``-th update of the critics."""
+    """TD3 agents; actor and targets are updated with every ``policy_delay``-th critic update."""
 
     PARTS: ClassVar = {
         "actor": ("actor.mu",),
@@ -73,7 +73,7 @@ class Td3Agents(OffPolicyAgents):
         return self._noisy(self.decide(observations), noise)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
-        """Add noise to random actions, too, as Stable-Baselines3 does."""
+        """Add noise to random actions as well, as Stable-Baselines3 does."""
         return self._noisy(actions, self.noise())
 
     def decide(self, observations: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ class Td3Agents(OffPolicyAgents):
             return self._actor("actor", observations)
 
     def update(self) -> None:
-        """Make one update of the critics, and of the actor if it is due."""
+        """Update the critics, and the actor if it is due."""
         delayed = self.updates % self.method.policy_delay != 0
         update, numbers = self.critics if delayed else self.both, self.numbers()
         shape = self.method.batch_size, self.sizes.actions

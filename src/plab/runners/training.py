@@ -1,7 +1,7 @@
-"""Bases of runners that train policies, one per run, and evaluate them in the hard contact model.
+"""Base classes of runners that train policies, one per run, and evaluate them in the hard contact model.
 
 :class:`PolicyRunner` alternates between some episodes of training and one episode of each deterministic
-policy, which gives a row of the results. :class:`ActorRunner`, the base of ``shac``, ``pods`` and ``bc``,
+policy, which produces a row of the results. :class:`ActorRunner`, the base of ``shac``, ``pods`` and ``bc``,
 trains one policy, with its networks, state and random scenes.
 """
 
@@ -107,8 +107,8 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
 
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) -> list[EpisodeBatch]:
-    """Return batches of environments, of some configurations and a contact model each, in their initial
-    states: reused from the last run if compatible."""
+    """Return batches of environments in their initial states, each for some configurations and a contact
+    model, reused from the last run if compatible."""
 
     # Imported here, because it imports the simulator.
     from plab.config import build_scene
@@ -137,9 +137,9 @@ class TrainingSummary:
     """Training of a policy since its last evaluation.
 
     Attributes:
-        measures: Means over the finished episodes, by the training's columns; NaN if none has.
-        ended: Number of these episodes.
-        broken: Times and reasons of divergences; these environments were frozen until the end of the episode.
+        measures: Means over the finished episodes, by training column; NaN if none has finished.
+        ended: Number of finished episodes.
+        broken: Times and reasons of divergence; diverged environments are frozen until the episode ends.
         losses: Mean losses of the updates, by name.
     """
 
@@ -155,8 +155,8 @@ def whole_cycles(steps: int, cycle: int) -> int:
 
 
 class PolicyRunner(Runner, ABC):
-    """Base of runners of policies in lockstep; each iteration consists of some training episodes and one
-    evaluation episode per policy.
+    """Base class of runners that train policies in lockstep; each iteration consists of some training
+    episodes and one evaluation episode per policy.
 
     Training proceeds in cycles of a batch of episodes or an update. All runs are at the same evaluation; if
     one fails, the others restart without it.
@@ -178,7 +178,8 @@ class PolicyRunner(Runner, ABC):
     # ------------------------------------------------------------------------------------------------ hooks
 
     def environments(self, cfg: Config) -> list[Config]:
-        """Return the configurations of a run's training environments; none if it needs no simulations."""
+        """Return the configurations of a run's training environments, or none if the method needs no
+        simulations."""
         return [cfg] * cast(Any, cfg.method).num_envs
 
     @abstractmethod
@@ -192,16 +193,16 @@ class PolicyRunner(Runner, ABC):
 
     @abstractmethod
     def cycle(self) -> None:
-        """Train for one cycle, and report the progress."""
+        """Train for one cycle and report the progress."""
 
     @abstractmethod
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the deterministic policies' actions, shape [run, A], for an observation of each, shape [run,
-        entry]."""
+        """Return the actions of the deterministic policies, shape [run, A], given one observation each, shape
+        [run, entry]."""
 
     @abstractmethod
     def take(self) -> list[TrainingSummary]:
-        """Return each policy's training since the last call."""
+        """Return a summary of each policy's training since the last call."""
 
     @abstractmethod
     def states(self) -> list[dict[str, Any]]:
@@ -209,11 +210,11 @@ class PolicyRunner(Runner, ABC):
 
     @abstractmethod
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Restore a policy from one of :meth:`states`; raise RuntimeError, ValueError or LookupError if it
-        belongs to other networks."""
+        """Restore a policy from a state returned by :meth:`states`; raise RuntimeError, ValueError or
+        LookupError if the state belongs to other networks."""
 
     def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
-        """Return a policy's replay buffer and its index there, if it has one."""
+        """Return the replay buffer of a policy and the policy's index in it, or None."""
         return None
 
     @abstractmethod
@@ -223,7 +224,8 @@ class PolicyRunner(Runner, ABC):
     # ------------------------------------------------------------------------------- shared implementation
 
     def set_cycle(self, batch: EpisodeBatch, cycle: int) -> None:
-        """Plan ``method.episodes`` episodes in cycles with the given number of transitions per policy."""
+        """Plan ``method.episodes`` episodes in cycles, given the number of transitions per cycle and
+        policy."""
         self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
         self.total_steps = whole_cycles(self.method.episodes * self._horizon, cycle)
 
@@ -272,7 +274,7 @@ class PolicyRunner(Runner, ABC):
         return track.iteration == 0 or self.steps < self.total_steps
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Train until the next evaluation is due, except before the first one, and evaluate all policies."""
+        """Train until the next evaluation, except before the first one, and evaluate all policies."""
         if len(tracks) < len(self.tracks):
             raise TogetherError("a run has failed")
         before = self.steps
@@ -328,8 +330,8 @@ def _replay_path(track: Track) -> Path:
 
 
 def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
-    """Return the reason why a run cannot continue, or an empty text; count diverged episodes in the result's
-    provenance, with a warning."""
+    """Return the reason why a run cannot continue, or an empty string; count diverged episodes in the
+    result's provenance, with a warning."""
     broken = learned.broken
     if not np.isfinite(done.actions).all():
         return NOT_FINITE
@@ -355,7 +357,7 @@ class ActorConfig(PolicyConfig):
 
     Attributes:
         scenes: Number of random training scenes; 0: the run's own scene.
-        num_envs: Number of environments simulated together; more scenes are used in turn.
+        num_envs: Number of environments simulated together; additional scenes are used in turn.
     """
 
     scenes: int = field(metadata=ranges.NOT_NEGATIVE)
@@ -387,7 +389,7 @@ def actor_policy(spaces: Spaces, hidden: Sequence[int]) -> Any:
 
 
 class ActorRunner(PolicyRunner):
-    """Base of runners of one policy, with its optimiser and training episodes.
+    """Base class of runners that train one policy, with its optimiser and training episodes.
 
     Attributes:
         network: The policy.
@@ -401,13 +403,14 @@ class ActorRunner(PolicyRunner):
         method: Any = cfg.method
         if method.torch_device != cfg.sim.device:
             raise ConfigError(
-                f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
-                f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
+                f"{method.algorithm} needs its networks on the simulator's device: set "
+                f"method.torch_device={cfg.sim.device}, as sim.device"
             )
         return training_scenes(cfg, method, method.num_envs)
 
     def prepare(self, batch: EpisodeBatch) -> None:
-        """Begin; the configuration's seed determines the initial weights and all later random numbers."""
+        """Initialise; the configuration's seed determines the initial weights and all later random
+        numbers."""
         from stable_baselines3.common.running_mean_std import RunningMeanStd
 
         self.set_cycle(batch, self.round_episodes[0] * batch.size * batch.horizon)
@@ -433,7 +436,7 @@ class ActorRunner(PolicyRunner):
 
     @abstractmethod
     def learn(self, rate_left: float) -> None:
-        """Run a round of training episodes; ``rate_left`` falls linearly from 1 to 0 over the training."""
+        """Run a round of training episodes; ``rate_left`` decreases linearly from 1 to 0 during training."""
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(Policy(self.network, *self._moments)(observations.cpu().numpy()))
@@ -446,12 +449,12 @@ class ActorRunner(PolicyRunner):
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
     def freeze_moments(self) -> None:
-        """Scale observations by the current moments from here on."""
+        """Scale observations by the current moments from now on."""
         mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self._moments)
         self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
 
     def scaled(self, observations: torch.Tensor) -> torch.Tensor:
-        """Scale observations by the moments of the last :meth:`freeze_moments`."""
+        """Scale observations by the moments at the last :meth:`freeze_moments`."""
         return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
 
     def note(self, **values: torch.Tensor | np.ndarray) -> None:

@@ -1,6 +1,6 @@
-"""Open-loop trajectory optimisation: sequences of actions, improved by the gradient through the simulator.
+"""Open-loop trajectory optimisation: action sequences improved by the simulator's gradient.
 
-The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. Each run of a batch has its
+The methods ``adam``, ``gd`` and ``adam_h`` differ only in their configuration. Each run of a batch has its
 own environment in a shared simulator; its numbers do not depend on the other runs. To reproduce a result:
 
     python -m plab.run task=Rope variant=1 method=adam seed=0
@@ -29,19 +29,19 @@ class TrajectoryConfig(MethodConfig):
     """Open-loop optimisation of the action sequence through the differentiable simulator.
 
     Attributes:
-        optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
+        optimizer: Update rule, ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
         lr_by_task: Learning rates by ``protocol.numbers`` and task, or ``other``. Empty in a run's
             configuration; ``lr`` has the value.
-        contact_by_task: Weights of the contact term by term and task. Empty likewise; ``loss_weights`` has
-            the value.
-        betas: Decay rates of adam's two moment estimates.
-        eps: Added to adam's denominator.
-        momentum: gd's momentum, on (1 - momentum)-weighted gradients.
+        contact_by_task: Weights of the contact term by term and task. Empty in a run's configuration;
+            ``loss_weights`` has the value.
+        betas: Decay rates of Adam's two moment estimates.
+        eps: Epsilon in Adam's denominator.
+        momentum: Momentum of gd, for (1 - momentum)-weighted gradients.
         max_gradient_norm: Longer gradients are scaled down to this norm; None sets no limit.
-        max_gradient_norm_by_numbers: Limits by ``protocol.numbers``. Empty likewise.
-        iterations: Rollouts with gradient, hence updates.
-        action_init: Initial actions are uniform in +- this.
+        max_gradient_norm_by_numbers: Limits by ``protocol.numbers``. Empty in a run's configuration.
+        iterations: Number of rollouts with gradient, equal to the number of updates.
+        action_init: Half width of the uniform distribution of initial actions.
     """
 
     optimizer: str
@@ -58,7 +58,7 @@ class TrajectoryConfig(MethodConfig):
 
 
 class TrajectoryRunner(Runner):
-    """Runner of a sequence of actions per run; each iteration is one rollout of all, with gradient.
+    """Runner of one action sequence per run; each iteration is one joint rollout with gradient.
 
     If loss, gradient or state of a run diverge, the run fails, and the others continue.
     """
@@ -75,7 +75,7 @@ class TrajectoryRunner(Runner):
         self.problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Sample the initial actions, or load those of the file."""
+        """Sample the initial actions, or load those in the file."""
         scene = self.problem.scenes[track.number]
         method = track.cfg.method_as(TrajectoryConfig)
         kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
@@ -87,7 +87,7 @@ class TrajectoryRunner(Runner):
             self._finalists[track.number] = Finalists.of(state["finalists"])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Simulate the actions of all runs, and update those of each run by their gradient."""
+        """Simulate the actions of all runs, and update each run's actions by their gradient."""
         tried = self.actions_at_rest()
         for track in tracks:
             tried[track.number] = self._rules[track.number].actions
@@ -120,15 +120,15 @@ class TrajectoryRunner(Runner):
                 {"actions": rule.actions, "optimizer": dict(rule.state), "finalists": finalists.state()},
                 steps_forward=checks.get(track, 0) * len(rule.actions),
                 steps_gradient=len(rule.actions),
-                # Before the first check, the actions of the lowest loss are kept.
+                # Before the first check, the actions with the lowest loss are kept.
                 whole=np.isnan(finalists.kept_score) or track not in judging,
                 best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
             )
             yield track, step
 
     def _check(self, tracks: Sequence[Track], ending: Sequence[Track]) -> dict[Track, int]:
-        """Evaluate the finalists of some runs in the hard contact model: the actions of highest score and,
-        for runs that end, those of lowest loss. Return the rollouts of each run."""
+        """Evaluate the finalists of some runs in the hard contact model: the actions with the highest score
+        and, for runs that end, those with the lowest loss. Return the rollouts of each run."""
         rollouts = dict.fromkeys(tracks, 0)
         for name, some in (("highest", tracks), ("lowest", ending)):
             chosen: dict[Track, Finalist] = {t: getattr(self._finalists[t.number], name) for t in some}
@@ -156,8 +156,8 @@ class TrajectoryRunner(Runner):
 
 @dataclass
 class Finalist:
-    """Actions, shape [T, A], with their iteration, loss and score, and their score in the hard contact model
-    after a check."""
+    """Actions, shape [T, A], with their iteration, loss and score, and after a check their score in the hard
+    contact model."""
 
     actions: np.ndarray
     iteration: int
@@ -175,10 +175,10 @@ class Finalists:
     The actions with the highest score there are kept, with ties broken by loss.
 
     Attributes:
-        highest: Actions of the highest score since the last check; None without any.
-        lowest: Actions of the lowest loss.
+        highest: Actions with the highest score since the last check, or None.
+        lowest: Actions with the lowest loss.
         kept_score: Score of the kept actions in the hard contact model; NaN before the first check.
-        kept_loss: Their loss.
+        kept_loss: Loss of the kept actions.
     """
 
     highest: Finalist | None = None
@@ -204,30 +204,30 @@ class Finalists:
         return best
 
     def state(self) -> dict[str, Any]:
-        """Return everything as arrays and numbers."""
+        """Return the full state as arrays and numbers."""
         return {n: vars(v) if isinstance(v, Finalist) else v for n, v in vars(self).items() if v is not None}
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> Finalists:
-        """Restore from a :meth:`state`."""
+        """Restore from a result of :meth:`state`."""
         own: dict[str, Any] = {n: Finalist(**v) if isinstance(v, Mapping) else v for n, v in state.items()}
         return cls(**own)
 
 
 class UpdateRule:
-    """Actions of an episode, and the rule that updates them by a gradient.
+    """Actions of an episode, and the rule that updates them by gradients.
 
     NumPy instead of ``torch.optim``, because importing torch takes 1.5 s of CPU time before the first
     progress line.
 
     Attributes:
-        method: Section ``method``, with the rates.
-        actions: Each in [-1, 1], shape [T, A], float64.
+        method: The ``method`` section, with the rates.
+        actions: Actions in [-1, 1], shape [T, A], float64.
         state: State between updates by name: arrays of the actions' shape, or numbers.
     """
 
     def __init__(self, method: TrajectoryConfig, shape: tuple[int, int], seed: int) -> None:
-        """Sample the initial actions, uniform in +-``method.action_init``."""
+        """Sample the initial actions uniformly in +-``method.action_init``."""
         self.method = method
         self.actions = (2.0 * uniform(seed, shape) - 1.0) * method.action_init
         self.state: dict[str, np.ndarray] = {}
@@ -246,7 +246,8 @@ class UpdateRule:
 
 
 class Adam(UpdateRule):
-    """Adam (arXiv:1412.6980), in the order of ``torch.optim.Adam``'s operations, which agrees to rounding."""
+    """Adam (arXiv:1412.6980), with the operations in the order of ``torch.optim.Adam``, so that results agree
+    to rounding."""
 
     def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         zeros = np.zeros_like(actions)
@@ -261,7 +262,7 @@ class Adam(UpdateRule):
 
 
 class Momentum(UpdateRule):
-    """Gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
+    """Gradient descent: v <- m v + (1 - m) g, with v = 0 initially; actions <- actions - lr v."""
 
     def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         m = self.method.momentum
@@ -271,7 +272,7 @@ class Momentum(UpdateRule):
 
 
 def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return uniform numbers in [0, 1), float64, equal to ``torch.rand`` with the same seed.
+    """Return uniform random numbers in [0, 1), float64, equal to ``torch.rand`` with the same seed.
 
     They are the lower 53 bits of two consecutive outputs of the Mersenne Twister.
     """
@@ -282,7 +283,7 @@ def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 
 
 FAMILY = Family(
-    label="a sequence of actions, improved by its gradient",
+    label="an action sequence, improved by its gradient",
     config=TrajectoryConfig,
     runner=TrajectoryRunner,
     columns=("gradient_norm", "kept_score"),

@@ -146,7 +146,7 @@ def _numbers(
     try:
         actions = actions.detach() if on_device(actions) else np.asarray(actions, np.float64)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"actions must form a numeric array: {error}") from None
+        raise ArgumentError(f"actions must be a numeric array: {error}") from None
     shape = tuple(actions.shape)
     if len(shape) != len(expected) or any(n not in (None, m) for n, m in zip(expected, shape, strict=True)):
         named = "(batch, components)" if None not in expected else "(batch, steps, components)"

@@ -21,17 +21,17 @@ def example_archive(name: str = EXAMPLES[0]) -> Path:
 
 
 def resolve(source: str | Path) -> Path:
-    """Return a source of results, a bundled archive for the names :data:`EXAMPLES`; use ``./example`` for a
-    folder of that name."""
+    """Return a source of results, replacing names in :data:`EXAMPLES` by bundled archives; use ``./example``
+    for a folder of that name."""
     return _relative(example_archive(str(source))) if str(source) in EXAMPLES else Path(source)
 
 
 def measurements(folder: str | Path) -> Path:
-    """Return a folder of benchmark files, the bundled ones for the names :data:`EXAMPLES`."""
+    """Return a folder of benchmark files, replacing names in :data:`EXAMPLES` by the bundled files."""
     return _relative(Path(__file__).parent) if str(folder) in EXAMPLES else Path(folder)
 
 
 def _relative(path: Path) -> Path:
-    """Shorten a path for reports, to not reveal local folders."""
+    """Shorten a path for reports, so that local folders are not revealed."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
