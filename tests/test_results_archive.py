@@ -155,7 +155,7 @@ def _evaluation(run: RunResult, **values: float) -> RunResult:
 
 
 BROKEN = {
-    "status 'done' is none of": lambda r: dataclasses.replace(r, status="done"),
+    "status 'done' is not one of": lambda r: dataclasses.replace(r, status="done"),
     "config_hash is not that of config": lambda r: dataclasses.replace(r, config_hash="0" * 64),
     "iterations lack reward": lambda r: dataclasses.replace(
         r, columns={name: values for name, values in r.columns.items() if name != "reward"}
