@@ -1,4 +1,4 @@
-"""Benchmarks of speed, accuracy, stability and of policies; each module has its own command line."""
+"""Benchmarks of speed, accuracy, stability and policies; each module has its own command line."""
 
 from __future__ import annotations
 

@@ -4,12 +4,12 @@
     plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
     plab bench accuracy --task Move,Rope --device cuda
 
-Settings differ in the number of substeps, from below the stability limit upwards, in precision, in how the
-material is computed (series or singular values), in contact model, and in the grid, with as many particles
-per cell. Each is compared with a reference of its contact model in float64 with many more substeps (for the
-grids: on the finest of them): root mean square of the final positions' distances [domain units], L1 distance
-of the mass tensors relative to the mass, score, and the gradient's relative norm and angle. Run times are
-those of an environment step with gradient, of one environment.
+Settings differ in the number of substeps (from below the stability limit upwards), precision, material update
+(series or singular values), contact model, and grid (with a constant number of particles per cell). The
+reference for each contact model uses float64 and many more substeps, or the finest grid. Errors are the root
+mean square distance of the final positions [domain units], the L1 distance of the mass tensors relative to
+the mass, the score, and the relative norm and the angle of the gradient. Run times are per environment step
+with gradient, for one environment.
 
 The actions are 0.7 times those of a demonstration, and the target is the final state of the demonstration in
 the hard contact model, so that scores correspond to partial success. The loss has the suite's terms of the
@@ -54,7 +54,7 @@ COLUMNS = (
 
 
 class UncheckedScene(Scene):
-    """A scene that may exceed the stability limit, to show the effect."""
+    """A scene that may exceed the stability limit, for measuring the effect."""
 
     @property
     def stable_dt(self) -> float:
@@ -78,13 +78,13 @@ class Plan:
 
     Attributes:
         grid: Grid of the settings that differ in substeps.
-        substeps: Their substeps.
-        usual: Number of substeps for which the materials are compared.
+        substeps: Substeps of these settings.
+        usual: Number of substeps for comparing the materials.
         reference: Substeps of the reference.
-        grids: Grids, the finest last; it is the reference.
+        grids: Grids; the last and finest is the reference.
         steps: Environment steps.
         particles: Particles at ``grid``.
-        repeats: Timed rollouts after the first, which compiles; the fastest counts.
+        repeats: Number of timed rollouts after the first, which compiles; the fastest counts.
     """
 
     grid: int = 64
@@ -126,14 +126,15 @@ class Result:
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too; NaN if one vanishes."""
+    """Angle between two arrays as vectors [degrees], accurate for small angles, too; NaN if one of them is
+    0."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
     return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
 
 def lattice(body: Body, spacing: float) -> np.ndarray:
-    """Return particles on a regular lattice inside a body, shape [particle, 3]; neighbours have a distance of
-    ``spacing`` [domain units]."""
+    """Return particles on a regular lattice with ``spacing`` [domain units] inside a body, shape [particle,
+    3]."""
     half = body.half_extent()
     counts = np.maximum(np.round(2.0 * half / spacing).astype(int), 1)
     axes = [(np.arange(n) + 0.5) / n * 2.0 * h - h for n, h in zip(counts, half, strict=True)]
@@ -173,8 +174,8 @@ class Attempt:
         return UncheckedScene(**vars(scene) | changes), x
 
     def run(self, setting: Setting, repeats: int) -> dict[str, Result]:
-        """Simulate and time one setting, and return a result per contact model. The first setting of an axis
-        determines the target, as the final state of the demonstration."""
+        """Simulate and time one setting; return one result per contact model. The first setting of an axis
+        determines the target, the final state of the demonstration."""
         scene, x = self._start(setting)
         simulator = Simulator(
             [scene],
@@ -251,7 +252,7 @@ def rows(tasks: Sequence[str], plan: Plan, device: str) -> Iterator[dict[str, An
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Compare settings with references, print, write the table and the diagrams."""
+    """Compare settings with references, print rows, and write table and diagrams."""
     from plab.report.figures import diagrams, save, style
 
     parser = Parser("plab bench accuracy", __doc__)

@@ -1,4 +1,4 @@
-"""Time of an environment step.
+"""Benchmark of the time per environment step.
 
     plab bench speed                                       Move on the CPU
     plab bench speed --quick                               the same in less than a minute
@@ -88,7 +88,7 @@ def rows(
 
 
 def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, object]:
-    """Return the milliseconds per environment step of one environment of a task, beside the paper's."""
+    """Return the milliseconds per environment step of one environment of a task, next to the paper's."""
     paper = paper_table("timing").set_index("task").loc[cfg.task.name]
     found: dict[Any, Any] = {row["what"]: row for row in rows(cfg, batch, steps, repeats, PAPER_KINDS)}
     out: dict[str, object] = {
@@ -106,7 +106,8 @@ def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, ob
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Time environment steps, print, write the requested files; return 1 if a row needs too much memory."""
+    """Time environment steps, print rows, and write the requested files; return 1 if a row needs too much
+    memory."""
     parser = Parser("plab bench speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configurations, as for plab run -m: task=Move,Rope")
     parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
@@ -115,7 +116,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="kinds of calls to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
-    parser.add_argument("--paper", action="store_true", help="the paper's table beside ours")
+    parser.add_argument("--paper", action="store_true", help="the paper's table next to ours")
     options = parser.parse_intermixed_args(argv)
     words = prepared(options.overrides)
     if "task" not in {one.key_or_group for one in parse(words)}:

@@ -1,11 +1,11 @@
-"""Stability of the simulator under violent actions.
+"""Stability of the simulator under extreme actions.
 
     plab bench stability                      # everything, in both precisions
     plab bench stability --quick              # a few minutes on two cores
     plab bench stability --precision float32 --csv cases.csv
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
-steps, and of first variants over 1000. Every case is simulated forwards and backwards. A case passes if
+steps, and first variants over 1000 steps. Every case is simulated forwards and backwards. A case passes if
 state, loss terms and gradient are finite, no particle moved by more than a cell in a substep, all particles
 are inside the domain, and the mass tensor contains all mass. The exit code is 1 if any case failed.
 """
@@ -37,12 +37,12 @@ COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where
 
 
 def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Uniform and independent, shape [steps, size]."""
+    """Uniform, independent actions, shape [steps, size]."""
     return rng.uniform(-1.0, 1.0, size=(steps, size))
 
 
 def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Each component is at either end of its range, for up to :data:`HOLD` steps."""
+    """Actions whose components are at either end of their range for up to :data:`HOLD` steps each."""
     out = np.empty((steps, size))
     for column in out.T:
         lengths = rng.integers(1, HOLD + 1, size=steps)
@@ -73,7 +73,7 @@ def rows(precision: str, quick: bool) -> Iterator[dict[str, object]]:
 
 
 def stress_simulator(scenes: Sequence[Any], precision: str, contact_weight: float) -> Simulator:
-    """Return a simulator of some scenes whose target is a ball in the middle."""
+    """Return a simulator of some scenes whose target is a ball in the centre."""
     terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": contact_weight})
     simulator = Simulator(scenes, terms=terms, precision=precision)
     n = simulator.grid_size
@@ -138,7 +138,7 @@ def summarise(rows: Iterable[Mapping[str, object]]) -> int:
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Simulate the cases, print, write the requested file; return the exit code."""
+    """Simulate the cases, print rows, and write the requested file; return the exit code."""
     parser = Parser("plab bench stability", __doc__)
     what = "one variant of each task, 64 particles instead of 300"
     parser.add_argument("--quick", action="store_true", help=what)

@@ -51,8 +51,8 @@ def rows(
     words: Sequence[str],
     observe: str | Sequence[str],
 ) -> Iterator[dict[str, object]]:
-    """Measure policies, given by name with overrides of their configurations and training scenes, in
-    ``count`` scenes, ``together`` at a time. ``words`` are additional overrides."""
+    """Measure policies, given by name with the overrides of their configurations and their training scenes,
+    in ``count`` scenes, ``together`` at a time. ``words`` are additional overrides."""
     # Imported here, because SciPy would slow down every `--help`.
     from scipy import stats
 
@@ -93,12 +93,13 @@ def main(argv: Sequence[str]) -> None:
     """Score policies in unseen scenes, variant=random of their task.
 
     plab bench unseen RESULT ...                       policies trained by runs
-    plab bench unseen --policy MODULE:NAME task=TASK   a function of your own: actions, shape [scene, action],
-                                                       for observations, shape [scene, entry], or by key
+    plab bench unseen --policy MODULE:NAME task=TASK   your own function: actions, shape [scene, action],
+                                                       from observations, shape [scene, entry], or by key
 
     A row has the mean score in the hard contact model with its 95 % interval (Student's t), the median, and
-    the share of scenes with at least 0.9. Overrides change the configuration; the policy of a run keeps the
-    observation and the simulation of its training. Scenes that do not fit a coarse grid are left out.
+    the fraction of scenes with at least 0.9. Overrides change the configuration; the policy of a run keeps
+    the observation and the simulation settings of its training. Scenes that do not fit a coarse grid are
+    skipped.
 
     EXAMPLES
       plab bench unseen results/Move-vrandom9000/pods/seed0-12ab34cd.h5 --csv unseen.csv

@@ -22,10 +22,10 @@ ROLLOUT = "rollout + losses"
 GRADIENT = "forward + backward"
 
 NOISE = 0.02
-"""Half-width of the noise that makes the actions of a batch's environments differ."""
+"""Half width of the noise by which the actions of a batch's environments differ."""
 
 SOLID = 0.1
-"""Mass of a node that belongs to the target, as a share of the largest mass of any node."""
+"""Mass above which a node belongs to the target, as a fraction of the largest node mass."""
 
 WARM_UP = 2
 """Number of warm-up calls after the first, which compiles; the CPU's kernels select their team sizes in
@@ -40,7 +40,7 @@ class Workload:
         cfg: The configuration of all environments.
         simulator: Simulator; the actions start from its initial state.
         actions: Actions, shape [batch, T, A].
-        first_step_s: Seconds of the very first step, which compiles or loads from Taichi's cache.
+        first_step_s: Duration of the first step [s], which compiles or loads from Taichi's cache.
     """
 
     cfg: Config
@@ -50,20 +50,20 @@ class Workload:
 
     @property
     def steps(self) -> int:
-        """Environment steps of a rollout."""
+        """Environment steps per rollout."""
         return self.actions.shape[1]
 
 
 def with_particles(overrides: Sequence[str], particles: int) -> Config:
-    """Compose a configuration with a number of particles."""
+    """Compose a configuration with a given number of particles."""
     whole = sum(body.particles for body in load_config(overrides).task.bodies.values())
     return load_config([*overrides, f"sim.particles_scale={particles / whole}"])
 
 
 def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> Workload:
-    """Build a simulator of a batch of environments in a state with contact.
+    """Build a simulator for a batch of environments in a state with contact.
 
-    The target is the shifted initial shape, because generating the task's own target takes time without
+    The target is the shifted initial shape, because generating the task's own target would take time without
     affecting the measurement. A rollout has ``steps`` environment steps; it starts in the middle of the best
     known actions, or with ``from_start`` in the scene's initial state.
     """
@@ -104,7 +104,7 @@ def _run(simulator: Simulator, actions: np.ndarray, *, until_contact: bool = Fal
 
 
 def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:
-    """Return the actions of an episode, shape [batch, T, A]: the best known, or random ones."""
+    """Return the actions of an episode, shape [batch, T, A]: the best known actions, or random ones."""
     rng = np.random.default_rng(0)
     known = known_actions(cfg)
     if known is None:
@@ -132,16 +132,16 @@ KINDS: dict[str, Callable[[Workload], None]] = {
     ROLLOUT: lambda load: _rollout(load, gradient=False),
     GRADIENT: lambda load: _rollout(load, gradient=True),
 }
-"""Kinds of calls that can be timed. The reward needs the loss terms and the IoU of every step on the host. A
+"""Kinds of timed calls. The reward needs the loss terms and the IoU of every step on the host. A
 rollout is one call for all steps and their loss terms, as in optimisers; the backward pass includes it."""
 
 
 def time_calls(load: Workload, kind: str, repeats: int) -> tuple[float, np.ndarray]:
-    """Time one of the :data:`KINDS`, cold and after the warm-up.
+    """Time one of the :data:`KINDS`, cold and after warm-up.
 
     Returns:
-        Seconds of the first call, which compiles, or loads from Taichi's cache; milliseconds per environment
-        step of ``repeats`` calls: median, least, most.
+        Duration of the first call [s], which compiles or loads from Taichi's cache; median, minimum and
+        maximum of ``repeats`` calls [ms per environment step].
     """
     seconds = []
     for _ in range(1 + WARM_UP + repeats):

@@ -1,4 +1,4 @@
-"""``python -m plab.export``: the same as ``plab export``."""
+"""``python -m plab.export``: alias of ``plab export``."""
 
 from plab.cli.rollouts import export
 

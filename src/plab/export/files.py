@@ -1,4 +1,5 @@
-"""VTK and PLY files of particles with their fields, surfaces of plasticine and manipulators, and the target.
+"""Export of rollouts as VTK and PLY files: particles with fields, surfaces of plasticine and manipulators,
+and the target.
 
 Files are written by VTK, through PyVista.
 """
@@ -24,9 +25,9 @@ from plab.results.run_file import replace_file
 def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     """Write a rollout as VTK XML files and an index of each series over time [s], which ParaView opens.
 
-    Writes ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd``, with the
-    numbers of bodies and manipulators, and ``target.vtp``. The rollout must have motion; frames are ``every``
-    environment steps apart.
+    The files are ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd`` with
+    the numbers of bodies and manipulators, and ``target.vtp``. The rollout must have motion; frames are
+    ``every`` environment steps apart.
     """
     scene = recording.scene
     series: dict[str, dict[float, str]] = {}
@@ -81,7 +82,7 @@ def _frames(recording: RecordedRollout, every: int) -> Iterator[tuple[int, dict[
 
 
 def _merged(meshes: Iterable[tuple[int, pv.PolyData]], name: str) -> pv.PolyData:
-    """Merge numbered meshes into one, with their numbers at its points."""
+    """Merge meshes into one, with their numbers as point data."""
     found = []
     for number, mesh in meshes:
         mesh[name] = np.full(mesh.n_points, number)
@@ -92,7 +93,7 @@ def _merged(meshes: Iterable[tuple[int, pv.PolyData]], name: str) -> pv.PolyData
 def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], path: Path) -> None:
     """Write a mesh with points coloured from a palette."""
     rgb = np.array([pv.Color(color).int_rgb for color in palette], np.uint8)
-    # VTK's own writers end the process with a segmentation fault where a disk is full.
+    # VTK's own writers end the process with a segmentation fault if the disk is full.
     with TemporaryDirectory() as place:
         file = Path(place) / path.name
         mesh.triangulate().save(file, texture=rgb[np.asarray(numbers) % len(rgb)])
@@ -112,17 +113,17 @@ def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
     """Return the fields of the particles at a step of a recorded rollout with motion.
 
     Returns:
-        ``body``, its number; ``displacement`` since the start [domain units]; ``velocity`` [domain units /
-        s]; ``volume_ratio``, the determinant of the deformation gradient; ``elastic_strain``, the norm of its
-        deviatoric Hencky strain; ``yielding``, that strain divided by the one at which plasticine yields, 1
-        where it does (0 in bodies without a yield stress). Vectors of shape [particle, 3], else [particle].
+        ``body``, the number of the body; ``displacement`` since the start [domain units]; ``velocity``
+        [domain units / s]; ``volume_ratio``, the determinant of the deformation gradient; ``elastic_strain``,
+        the norm of its deviatoric Hencky strain; ``yielding``, the elastic strain divided by the yield strain
+        (0 in bodies without a yield stress). Vectors have shape [particle, 3], scalars [particle].
     """
     if recording.v is None or recording.F is None:
         raise ValueError("the recording has no velocities and deformation gradients")
     scene, F = recording.scene, recording.F[step]
     hencky = np.log(np.linalg.svd(F, compute_uv=False))
     strain = np.linalg.norm(hencky - hencky.mean(axis=1, keepdims=True), axis=1)
-    # A yield stress of 0 is that of a fluid: everything yields.
+    # With a yield stress of 0, as in a fluid, every particle yields.
     limits = [
         max(m.values.get("yield_stress", np.inf) / (2.0 * m.shear_modulus), np.finfo(float).tiny)
         for m in scene.materials

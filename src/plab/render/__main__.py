@@ -1,4 +1,4 @@
-"""``python -m plab.render``: the same as ``plab render``."""
+"""``python -m plab.render``: alias of ``plab render``."""
 
 from plab.cli.rollouts import render
 

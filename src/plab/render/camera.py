@@ -1,4 +1,4 @@
-"""Cameras that fit a scene, from a suitable direction for each task."""
+"""Cameras that frame a scene, from a suitable direction for each task."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def scene_camera(
     x: np.ndarray | None = None,
     poses: np.ndarray | None = None,
 ) -> Camera:
-    """Return a camera with a scene, its shadows on the floor and its target in view.
+    """Return a camera that shows a scene, its shadows on the floor and its target.
 
     Args:
         scene: The scene; its name selects the view from :data:`VIEWS`.
         target_mass: Mass tensor of the target, shape [n, n, n].
         size: Width and height of the pictures [pixels].
-        x: Positions of particles [domain units], shape [..., 3]; those at t = 0 if None.
-        poses: Poses of the manipulators, shape [time, manipulator, 8]; those at t = 0 if None.
+        x: Particle positions [domain units], shape [..., 3]; default: at t = 0.
+        poses: Poses of the manipulators, shape [time, manipulator, 8]; default: at t = 0.
     """
     # Imported here: fit_camera needs no PyVista.
     from plab.render.shapes import manipulator_parts, pose_matrix
@@ -83,9 +83,9 @@ def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
     """Return a camera with all points in view.
 
     Args:
-        points: Points in the picture [domain units], shape [point, 3].
-        view: Direction to look from.
-        aspect: Width of the picture over its height.
+        points: Points that must be visible [domain units], shape [point, 3].
+        view: Viewing direction.
+        aspect: Width of the picture divided by its height.
     """
     azimuth, elevation = math.radians(view.azimuth), math.radians(view.elevation)
     level = math.cos(elevation)

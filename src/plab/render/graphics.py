@@ -1,4 +1,4 @@
-"""Requirements of rendering: packages, and off-screen OpenGL."""
+"""Requirements of rendering: packages and off-screen OpenGL."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
 
 
 class RenderError(PlabError, RuntimeError):
-    """A picture cannot be drawn or written; the one-line message states the reason and the remedy."""
+    """Picture that cannot be drawn or written; the one-line message states the reason and the remedy."""
 
 
 def require_graphics() -> None:
@@ -25,8 +25,8 @@ def require_graphics() -> None:
 
 
 def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) -> None:
-    """Raise :class:`RenderError` if a package, given by module and display name, is missing; ``who_needs``
-    begins the message, and ``extra`` installs it."""
+    """Raise :class:`RenderError` if a package, given by module and display name, is missing; the message
+    begins with ``who_needs``, and names the ``extra`` that installs the package."""
     for package, name in packages.items():
         if find_spec(package) is None:
             raise RenderError(f"{who_needs} {name}, which is not installed: pip install 'plab[{extra}]'")
@@ -34,7 +34,7 @@ def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) ->
 
 @functools.cache
 def missing_graphics() -> str | None:
-    """Return the missing packages for rendering, and how to install them; None if nothing is.
+    """Return the missing requirements of rendering and how to install them, or None.
 
     On Linux, VTK renders through EGL, which needs no screen, unless the environment variable
     ``VTK_DEFAULT_OPENGL_WINDOW`` is set.
@@ -54,7 +54,7 @@ def missing_graphics() -> str | None:
 
 
 def _egl_works() -> bool:
-    """Return whether EGL has a device; the software renderer counts as one."""
+    """Return whether EGL has a device, which may be the software renderer."""
     try:
         # Without it VTK would end the process with a segmentation fault.
         ctypes.CDLL("libEGL.so.1")

@@ -32,7 +32,7 @@ SUFFIXES = (".png", ".gif", ".mp4")
 
 _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
-_SET_EVERY = 2  # environment steps from one frame to the next, of a set
+_SET_EVERY = 2  # environment steps between frames of a set
 
 _PAGE_SIZE = (480, 360)
 _RENDER_ERRORS = (
@@ -57,7 +57,7 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         recording: The rollout.
         path: File to write; see :func:`check_output`.
         size: Width and height of a frame [pixels]; even numbers for MP4.
-        every: Environment steps from one frame of a film to the next.
+        every: Environment steps between frames of a film.
     """
     write = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}[path.suffix.lower()]
     with _renderer(recording, size) as renderer, _writing(path) as fresh:
@@ -65,8 +65,8 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
 
 
 def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *, film: bool) -> None:
-    """Write pictures of a rollout, of a size [pixels, even numbers]: ``start.webp``, ``target.webp`` and its
-    last state ``end.webp``; and a film ``end.mp4``, if wanted and imageio-ffmpeg is installed."""
+    """Write pictures of a rollout with a size [pixels, even numbers]: ``start.webp``, ``target.webp`` and the
+    final state ``end.webp``; and a film ``end.mp4``, if requested and imageio-ffmpeg is installed."""
     first, last = recording.poses[0], recording.poses[-1]
     with _renderer(recording, size) as renderer, _writing(folder / "end"):
         pictures = {"start": renderer.frame(recording.x[0], first), "target": renderer.target(first)}
@@ -79,7 +79,7 @@ def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *,
 
 @contextmanager
 def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Renderer]:
-    """Open a renderer of a rollout, with all of it in view."""
+    """Open a renderer whose camera shows a whole rollout."""
     scene, mass = recording.scene, recording.target_mass
     x, poses = recording.x[[0, -1]].reshape(-1, 3), recording.poses[::5]
     with closing(Renderer(scene, mass, size, scene_camera(scene, mass, size, x, poses))) as renderer:
@@ -89,7 +89,7 @@ def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Ren
 @contextmanager
 def _writing(path: Path) -> Iterator[Path]:
     """Create the folder of a file, and yield a temporary path that replaces the file on success; raise
-    RenderError if it cannot be written."""
+    RenderError if the file cannot be written."""
     fresh = path.with_name(f"{UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,8 +140,8 @@ def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: 
     try:
         imageio_ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError:
-        # ffmpeg leaves a part of the film without an error.
-        raise OSError("the film is incomplete: is the disk full?") from None
+        # ffmpeg may write only part of the film without reporting an error.
+        raise OSError("the film is incomplete; the disk may be full") from None
 
 
 def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Iterator[np.ndarray]:
@@ -155,7 +155,7 @@ def _with_palette(picture: Image.Image, colors: int) -> Image.Image:
 
 
 def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
-    """Return pictures of one size in rows, each above its caption."""
+    """Return pictures of equal size in rows, each above its caption."""
     height, width, _ = tiles[0][0].shape
     text = max(12, height // 22)
     size = columns * (width + text) - text, -(-len(tiles) // columns) * (height + 2 * text)
@@ -172,12 +172,12 @@ def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
 
 
 def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None]) -> None:
-    """Render runs, see :func:`save_set`; those with films first.
+    """Render runs, see :func:`save_set`; runs with films come first.
 
     Args:
-        wanted: By folder, which must not exist and appears when it is complete, a result file, and whether to
-            make a film.
-        drawn: Called when a folder is complete.
+        wanted: Result file, and whether to make a film, by folder. Folders must not exist, and appear when
+            they are complete.
+        drawn: Callback after each completed folder.
 
     Raises:
         RenderError: If rendering is not possible, a file cannot be written, or runs cannot be replayed; all
@@ -206,8 +206,8 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
 
 
 def draw_strip(path: Path, picture: Path) -> None:
-    """Replay a run from its result file, and write start, target and end side by side as PNG; raise
-    RenderError if that is not possible."""
+    """Replay a run from its result file, and write initial state, target and final state side by side as PNG;
+    raise RenderError on failure."""
     require_graphics()
     try:
         save(record(*result(path)), picture, _PAGE_SIZE)

@@ -35,7 +35,9 @@ _METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25
 _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "smooth_shading": True}
 _MOVING_OPACITY = 0.8  # of manipulators, in front of the plasticine that they move
 _GHOST_OPACITY = 0.35
-_NEAR = 0.01  # depth of the ghost below the target's surface, hidden where that is reached [domain units]
+_NEAR = (
+    0.01  # depth of the translucent target below its surface [domain units]; plasticine hides reached parts
+)
 _SHADOW = {"color": "#c5c0ba", "lighting": False}
 
 
@@ -58,9 +60,9 @@ class Renderer:
 
         Args:
             scene: The scene.
-            target_mass: Mass tensor of the target, shape [n, n, n]; None draws no target.
+            target_mass: Mass tensor of the target, shape [n, n, n]; default: no target.
             size: Width and height of the pictures [pixels].
-            camera: Camera of the pictures; :func:`plab.render.camera.scene_camera` if None.
+            camera: Camera; default: :func:`plab.render.camera.scene_camera`.
         """
         if len(size) != 2 or min(size) < 1:
             raise ArgumentError(f"size must be width and height in pixels (got {size})")
@@ -90,7 +92,7 @@ class Renderer:
         self._flattened = np.array([[1, -x / y, 0, 0], [0, 0, 0, 1e-3], [0, -z / y, 1, 0], [0, 0, 0, 1]])
 
     def frame(self, x: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Render a state with the translucent target, which plasticine hides where it has reached it.
+        """Render a state with the translucent target, which is hidden where plasticine has reached it.
 
         Args:
             x: Particle positions [domain units], shape [particle, 3].
@@ -116,10 +118,10 @@ class Renderer:
         return self._draw()
 
     def target(self, poses: np.ndarray) -> np.ndarray:
-        """Render the target as plasticine, with the static manipulators; arguments and result as of
+        """Render the target as plasticine, with the static manipulators; arguments and result as in
         :meth:`frame`."""
         if self._target is None:
-            raise ArgumentError("this renderer has no target: give it target_mass")
+            raise ArgumentError("this renderer has no target: pass target_mass")
         self._set_up(poses, moving=False)
         self._add(self._target, "target", color=TARGET_COLOR, **_CLAY)
         return self._draw()
@@ -132,13 +134,13 @@ class Renderer:
             self._plotter = None
 
     def _set_up(self, poses: np.ndarray, *, moving: bool) -> pv.Plotter:
-        """Empty the window, and add the floor and the manipulators, also moving ones if asked."""
+        """Clear the window, and add the floor and the manipulators, optionally including moving ones."""
         if self._plotter is None:
-            raise RuntimeError("this renderer is closed: make a new one")
+            raise RuntimeError("this renderer is closed: create a new one")
         if np.shape(poses) != (len(self._parts), 8):
             raise ArgumentError(f"poses have shape {np.shape(poses)}, not {(len(self._parts), 8)}")
         self._plotter.clear_actors()
-        # It hides what is below, and its lines are slightly above it.
+        # The floor hides objects below it, and its lines are slightly above it.
         floor = pv.Plane(center=(0.5, 0.0, 0.5), direction=(0.0, 1.0, 0.0), i_size=1.8, j_size=1.8)
         self._plotter.add_mesh(floor, color=PAPER, lighting=False, reset_camera=False, render=False)
         lines = pv.line_segments_from_points(floor_lines(3e-3))

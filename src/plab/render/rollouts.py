@@ -56,7 +56,8 @@ class RecordedRollout:
 
 
 def result(path: Path) -> tuple[Config, np.ndarray]:
-    """As :func:`stored`, but on the CPU if this computer has no CUDA device."""
+    """Return configuration and best actions, as :func:`stored` does, but on the CPU if this computer has no
+    CUDA device."""
     cfg, actions = stored(path)
     if cfg.sim.device == "cuda" and not cuda_devices():
         print_once("the run used CUDA, which is not available: replaying it on the CPU")
@@ -65,8 +66,8 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
 
 
 def stored(path: Path) -> tuple[Config, np.ndarray]:
-    """Return the configuration for a replay, and the best actions of a result file; raise ResultsError if the
-    file cannot be read, RenderError if it has no actions yet, or they do not fit its task."""
+    """Return the configuration for a replay, and the best actions, of a result file; raise ResultsError if
+    the file cannot be read, RenderError if it has no actions yet or they do not fit its task."""
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
@@ -124,9 +125,9 @@ def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
-    """As :func:`record`, with velocities and deformation gradients.
+    """Simulate and record as :func:`record` does, with velocities and deformation gradients.
 
-    A target that cannot be generated, for example because its file is missing, is left out, with a message.
+    If the target cannot be generated, for example because its file is missing, it is omitted with a message.
     """
     try:
         problem = Problem([cfg])
@@ -135,7 +136,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
         scenes = build_scenes([cfg])
         return _recording(cfg, scenes[0], make_simulator(cfg, scenes), None, actions, motion=True)
     if cfg.targets.source is not None:
-        print_once(f"the output contains your target file, of {cfg.targets.source}: check its licence")
+        print_once(f"the output contains your target file from {cfg.targets.source}: check its licence")
     return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions, motion=True)
 
 
@@ -148,7 +149,7 @@ def _recording(
     *,
     motion: bool = False,
 ) -> RecordedRollout:
-    """Simulate actions, shape [T, A], with target and scores if there is a problem."""
+    """Simulate actions, shape [T, A], and record target and scores if a problem is given."""
     states, scores = [], []
     simulator.set_contact("hard")
     simulator.reset()

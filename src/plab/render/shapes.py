@@ -38,8 +38,8 @@ class Part:
     """A rigid part of a manipulator.
 
     Attributes:
-        mesh: Surface in the manipulator's frame [domain units], with normals, its edges sharp.
-        side: Offset along the own x axis, in gaps: +-1/2 for shapes that grip, 0 otherwise.
+        mesh: Surface in the manipulator's frame [domain units], with normals and sharp edges.
+        side: Offset along the local x axis, in gaps: +-1/2 for shapes that grip, otherwise 0.
     """
 
     mesh: pv.PolyData
@@ -71,7 +71,7 @@ def _capsule(length: float, radius: float) -> pv.PolyData:
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:
     """Return the homogeneous matrix, shape [4, 4], from the frame of a part with a :attr:`Part.side` to the
-    world, given the pose: position (3), quaternion w, x, y, z (4), gap (1), shape [8]."""
+    world, given the pose: position (3), quaternion w, x, y, z (4) and gap (1), shape [8]."""
     matrix = np.eye(4)
     # SciPy puts w last.
     matrix[:3, :3] = Rotation.from_quat(np.roll(pose[3:7], -1)).as_matrix()
@@ -112,7 +112,7 @@ def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
     occupied = np.argwhere(mass > 0)
     low, high = occupied.min(axis=0), occupied.max(axis=0) + 1
     part = np.pad(mass[tuple(map(slice, low, high))], _MARGIN)
-    # Twice as fine; the blur fills the intermediate nodes.
+    # On a grid twice as fine; the blur fills the intermediate nodes.
     fine = np.zeros(2 * np.array(part.shape) - 1, np.float32)
     fine[::2, ::2, ::2] = part / part.max()
     fine = gaussian_filter(fine, 2 * TARGET_BLUR, mode="constant")

@@ -1,4 +1,4 @@
-"""``python -m plab.report``: the same as ``plab report``."""
+"""``python -m plab.report``: alias of ``plab report``."""
 
 from plab.cli.report import main
 

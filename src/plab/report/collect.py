@@ -1,4 +1,4 @@
-"""Selection of finished runs of the suite that may be averaged, because they differ only in seed and
+"""Selection of finished runs of the suite that can be averaged because they differ only in seed and
 variant."""
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that are columns of the table of runs."""
 
 _SINGLE = ("seed_particles", *OBSERVATION_KEYS)
-"""Top-level configuration keys that must agree within a mean."""
+"""Top-level configuration keys that must agree between averaged runs."""
 
 _IGNORED_KEYS = (
     *("seed", "results_dir", "force", "progress", "logger", "checkpoint_seconds", "protocol.name"),
@@ -36,25 +36,25 @@ _IGNORED_KEYS = (
     "protocol.contact",
     "task.release",
 )
-"""Keys that may differ within a mean."""
+"""Keys that may differ between averaged runs."""
 
 
 class MixedRunsError(PlabError, ValueError):
-    """Runs that must not be averaged; the one-line message names the override that selects among them."""
+    """Runs that must not be averaged; the one-line message names an override that selects among them."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Finished runs, and the requested ones.
+    """Finished and requested runs.
 
     Attributes:
-        table: Table of :func:`plab.results.load`, a row per run.
+        table: Table of :func:`plab.results.load`, one row per run.
         tasks: Requested tasks.
         variants: Requested variants.
         methods: Requested methods, in the order of tables.
         seeds: Requested seeds.
         unusual: Settings that differ from plab's, as text, with methods if only some runs have them.
-        protocol: Name of their protocol.
+        protocol: Name of the runs' protocol.
         left_out: Notes on runs missing from ``table``, with reasons.
         configs: Configurations of the runs, in the order of ``table``.
     """
@@ -71,7 +71,7 @@ class Runs:
 
     @property
     def digest(self) -> str:
-        """SHA-256, in hex, of the runs' configurations, evaluations and times, independent of file
+        """SHA-256, in hex, of the runs' configurations, evaluations and times, which does not depend on file
         locations."""
         records = self.table.drop(columns="path").to_dict("records")
         lines = sorted(
@@ -95,11 +95,11 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         chosen: Selection of runs; defaults: the suite's tasks and variants, the methods and seeds of the
             paper and of the results.
         split: Setting whose values are treated as separate methods: a dotted key, ``folder`` or ``seed``;
-            none if empty.
+            empty: none.
 
     Raises:
-        MixedRunsError: If runs of one mean differ in their settings, or have the same seed.
-        plab.errors.ArgumentError: If there are runs of several protocols, or no runs differ in
+        MixedRunsError: If runs to be averaged differ in their settings, or have the same seed.
+        plab.errors.ArgumentError: If there are runs of several protocols, or no runs that differ in
             ``split``.
         plab.config.ConfigError: If the selection cannot match any run.
         plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
@@ -157,8 +157,8 @@ def _asked(found: Sequence[Row], chosen: Selection) -> dict[str, list[str]]:
 def _split(
     found: Sequence[Row], key: str, places: Sequence[Path]
 ) -> tuple[list[Row], dict[tuple[str, Any], str]]:
-    """Return runs with methods renamed if they have several values of a setting, and the new names by method
-    and value."""
+    """Return runs whose methods are renamed if they have several values of a setting, and the new names by
+    method and value."""
     pairs = [(row.values["method"], _split_value(row, key, places)) for row in found]
     new: dict[tuple[str, Any], str] = {}
     for name, value in sorted(set(pairs), key=lambda pair: (pair[0], isinstance(pair[1], str), pair[1])):
@@ -182,7 +182,7 @@ def _split_value(row: Row, key: str, places: Sequence[Path]) -> Any:
     if key == "folder":
         return next(str(place) for place in places if row.path.is_relative_to(place))
     if "." not in key:
-        raise ArgumentError(f"cannot split by '{key}': give a dotted key such as method.lr, folder or seed")
+        raise ArgumentError(f"cannot split by '{key}': use a dotted key such as method.lr, folder or seed")
     value = lookup(row.config, key)
     return value if isinstance(value, str | int | float) and value == value else json.dumps(value)
 
@@ -212,7 +212,7 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
 
 
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return the dotted keys in which configurations differ, with the values that occur."""
+    """Return the dotted keys in which configurations differ, with their values."""
     first = configs[0]
     # Most sections of thousands of runs are equal and need not be flattened.
     unlike = {
@@ -231,7 +231,7 @@ def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 def _prefer_usual(found: Sequence[Row], split: str) -> tuple[list[Row], list[str]]:
     """Select, for each task and method, the runs with the fewest changes to plab's settings, not counting the
-    key ``split``; return them, and their settings that differ from plab's."""
+    key ``split``; return these runs, and their settings that differ from plab's."""
     changes = [changed_settings(row.config) for row in found]
     fewest: dict[tuple[str, str], int] = {}
     for row, changed in zip(found, changes, strict=True):
@@ -284,7 +284,7 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
 
 @functools.cache
 def _default_settings(method: str, protocol: str) -> dict[str, Any]:
-    """Return method, protocol and sim of plab's files, without the method if it is not plab's."""
+    """Return the method, protocol and sim sections of plab's files, without the method if it is external."""
     # Composing needs Hydra.
     from plab.config import choices, load_config
     from plab.results import config_dict

@@ -1,4 +1,4 @@
-"""Figures of runs and of the benchmark of accuracy."""
+"""Figures of runs and of the accuracy benchmark."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Drawing:
     """A figure with its notes.
 
     Attributes:
-        name: Name of its files.
+        name: Name of the files.
         figure: The figure.
         notes: Notes on the figure.
         numbers: Plotted numbers, if few.
@@ -74,14 +74,14 @@ class Drawing:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Use plab's style inside the ``with`` block."""
+    """Use plab's Matplotlib style inside the ``with`` block."""
     with matplotlib.rc_context(cast(Any, _STYLE)):
         yield
 
 
 def grid(rows: int, columns: int, *, width: float = 2.1, height: float = 1.7) -> tuple[Figure, np.ndarray]:
-    """Return a figure with rows and columns of axes of the same size [inch], shape [row, column]."""
-    # Not by pyplot, which keeps references to figures and may need a display.
+    """Return a figure with rows and columns of equally sized axes [inch], shape [row, column]."""
+    # Without pyplot, which keeps references to figures and may need a display.
     figure = Figure(figsize=(max(width * columns, 3.2), height * rows + 0.5))
     return figure, figure.subplots(rows, columns, squeeze=False)
 
@@ -93,7 +93,7 @@ def single(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def legend(figure: Figure, columns: int | None = None) -> None:
-    """Add a common legend above all axes, in as many columns as fit, or in the given number."""
+    """Add a shared legend above all axes, with as many columns as fit, or the given number."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -116,7 +116,7 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
     metadata = {"pdf": {"CreationDate": None, "Subject": made}, "png": {"Description": made}}
     with style():
         for drawing in drawings:
-            # Laid out once, because for fifty panels it takes longer than drawing.
+            # Compute the layout once, because it takes longer than drawing for fifty panels.
             drawing.figure.draw_without_rendering()
             drawing.figure.set_layout_engine("none")
             for form, own in metadata.items():
@@ -131,7 +131,7 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
 
 
 def rewards(runs: Runs, series: Series) -> list[Drawing]:
-    """Return reward against episodes, per task and per configuration, all methods on one axis."""
+    """Return reward against episodes, per task and per configuration, with all methods on one axis."""
     notes = [
         "Reward of an episode (sum over its steps) against episodes simulated so far, including its own.",
         "Lines: mean over the runs; shaded: one standard deviation.",
@@ -200,8 +200,8 @@ def _tasks_with_runs(runs: Runs) -> list[str]:
 
 
 def rl_scores(runs: Runs) -> list[Drawing]:
-    """Return the final scores of the RL methods per task, beside the paper's and with the demonstrations'
-    limit; none for single bars."""
+    """Return the final scores of the RL methods per task, next to the paper's scores and the limit from
+    demonstrations, or None for single bars."""
     own = runs.table[[method(name).kind == RL for name in runs.table["method"]]]
     scores = own.pivot_table(index="task", columns="method", values="score")
     if scores.size < 2:
@@ -235,7 +235,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
 
 
 def agreement_plot(runs: Runs) -> list[Drawing]:
-    """Draw our mean score of each configuration against the paper's; none without common cells."""
+    """Plot our mean score of each configuration against the paper's; return None without common cells."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
@@ -326,7 +326,7 @@ _ERRORS = {
 """Columns of errors, and the labels of their axes."""
 
 _FLOOR = 1e-16
-"""Smallest error that is drawn."""
+"""Smallest plotted error."""
 
 # Both remain visible if they overlap.
 _LINES = {"float32": ("#D55E00", "-"), "float64": ("#0072B2", "--")}
@@ -334,8 +334,8 @@ _MARKS = {"series": "o", "singular values": "s"}
 
 
 def diagrams(table: pd.DataFrame) -> list[Drawing]:
-    """Draw run time against each kind of error, one figure per task and varied quantity, with a panel per
-    contact model and kind.
+    """Plot run time against each kind of error, with one figure per task and varied quantity, and one panel
+    per contact model and kind.
 
     Args:
         table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.measured`.

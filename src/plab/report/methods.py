@@ -11,13 +11,13 @@ from plab.config.suite import PAPER_METHODS
 
 @dataclass(frozen=True)
 class Method(Appearance):
-    """A method and its appearance.
+    """A method and its appearance in reports.
 
     Attributes:
         name: Name in results and configuration.
         kind: :data:`~plab.config.families.RL` or :data:`~plab.config.families.GRADIENT`; empty for a method
             that is not plab's.
-        of: Method of which these are some of the runs, empty for all: see :func:`part`.
+        of: Method whose runs were split, or empty: see :func:`part`.
     """
 
     name: str = ""
@@ -35,7 +35,7 @@ _STYLES = {
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
-# In the order of the paper, followed by further methods.
+# In the order of the paper, followed by other methods.
 _KNOWN = tuple(_STYLES[name] for name in dict.fromkeys((*PAPER_METHODS, *_STYLES)))
 
 
@@ -56,11 +56,11 @@ def part(name: str, key: str, value: str, place: int) -> str:
     Args:
         name: Name of the method.
         key: Name of the setting.
-        value: Its value.
+        value: Value of the setting.
         place: Index among these methods, which determines colour and line style.
 
     Returns:
-        Name of the new one.
+        Name of the new method.
     """
     whole, new = method(name), f"{name} {key}={value}"
     colour, dashes = _PALETTE[place % len(_PALETTE)], _DASHES[place % len(_DASHES)]
@@ -69,7 +69,7 @@ def part(name: str, key: str, value: str, place: int) -> str:
 
 
 def ordered(present: Iterable[str]) -> list[str]:
-    """Return the paper's methods, then the others present, in the order of tables and legends."""
+    """Return the paper's methods, then the other methods present, in the order of tables and legends."""
     others = set(present) - set(PAPER_METHODS)
     known = [known.name for known in _KNOWN if known.name in others]
     return [*PAPER_METHODS, *known, *sorted(others - set(known))]

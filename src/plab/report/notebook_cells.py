@@ -1,4 +1,4 @@
-"""Functions for the cells of the report notebooks in ``reports/``: find runs, show tables and figures."""
+"""Functions for cells of the report notebooks in ``reports/``: find runs, show tables and figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
     """Find the runs; show a message if there are none.
 
     Args:
-        results: Folders or archives; ``example`` is the bundled archive.
+        results: Folders or archives; ``example`` is a bundled archive.
         words: Selection of runs, as for ``plab report``.
     """
     runs = collect([resolve(source) for source in results], select(words, NAMES))
@@ -54,7 +54,7 @@ def say(text: str) -> None:
 
 
 def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
-    """Show a table of the report, or cells of text."""
+    """Show a table of the report, or text cells."""
     whole = table if isinstance(table, Table) else Table("", "", "", table, table, notes=list(notes))
     cells = whole.cells
     shown = cells.style.hide(axis="index").format(escape="html")
@@ -70,7 +70,7 @@ def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
 def show_figure(drawing: Drawing | None) -> None:
     """Show a figure with its notes, or a message for None."""
     if drawing is None:
-        say("*No figure: there are no runs for it.*")
+        say("*No figure, because there are no runs for it.*")
         return
     content = io.BytesIO()
     with style():
@@ -84,11 +84,11 @@ def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
     """Return the rows of a benchmark, or show the command that generates its file.
 
     Args:
-        folder: Folder of the benchmarks' files; ``example`` is the bundled one.
+        folder: Folder of benchmark files; ``example`` is the bundled one.
         which: The benchmark.
 
     Returns:
-        Its rows; None if the file is missing or invalid.
+        Rows of the benchmark; None if the file is missing or invalid.
     """
     try:
         return measured(measurements(folder) / which.file, which)

@@ -19,7 +19,7 @@ _PACKAGES = ("jupytext", "nbclient", "nbconvert", "nbformat", "ipykernel", "IPyt
 
 
 def notebook_folder() -> Path:
-    """Return the folder of the notebooks' sources: the source tree's ``reports/``, or that of a wheel.
+    """Return the folder of the notebook sources: ``reports/`` of the source tree or of a wheel.
 
     Raises:
         plab.results.ResultsError: If the installation is incomplete.
@@ -28,17 +28,17 @@ def notebook_folder() -> Path:
     for folder in (package / "reports", package.parents[1] / "reports"):
         if (folder / f"{NOTEBOOKS[0]}.py").is_file():
             return folder
-    raise ResultsError(f"no reports/ next to {package}: the installation is incomplete, install plab again")
+    raise ResultsError(f"no reports/ next to {package}: the installation is incomplete; install plab again")
 
 
 def execute(
     names: Sequence[str], parameters: Mapping[str, Any], out: Path, report: Callable[[int, str], None]
 ) -> list[Path]:
-    """Execute notebooks and write each as HTML, and as a notebook with outputs.
+    """Execute notebooks, and write each as HTML and as a notebook with outputs.
 
     Args:
         names: Names among :data:`NOTEBOOKS`.
-        parameters: Values for the names in the notebooks' cell ``parameters``.
+        parameters: Values for the names in the ``parameters`` cell of the notebooks.
         out: Folder to write to.
         report: Callback with the number of finished notebooks, and the name of the last one.
 

@@ -1,4 +1,4 @@
-"""Static page of results: overview; curves, pictures, films and runs of each configuration.
+"""Static results page: overview; curves, pictures, films and runs of each configuration.
 
 The page needs no server and no network. ``index.html`` contains style, script and the overview. The curves of
 a configuration are in a script below ``data/``, loaded on demand, because pages opened as files can load
@@ -41,10 +41,10 @@ _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "co
 
 
 class Page:
-    """Page of some runs: numbers are computed once, pictures are added when they are rendered.
+    """Page of some runs; numbers are computed once, pictures are added as they are rendered.
 
     Attributes:
-        shown: Configurations and their runs in pictures.
+        shown: Configurations and their runs shown in pictures.
     """
 
     def __init__(self, runs: Runs, out: Path, command: str) -> None:
@@ -109,7 +109,7 @@ class Page:
         replace_file(self._out / "index.html", html)
 
     def missing_pictures(self) -> dict[Path, tuple[Path, bool]]:
-        """Return the folders of missing pictures, with result file and whether there is a film."""
+        """Return the folders of missing pictures, with the result file and whether there is a film."""
         folders = {self._out / one.folder: (Path(one.run["path"]), one.film) for one in self.shown}
         return {folder: wanted for folder, wanted in folders.items() if not folder.is_dir()}
 
@@ -123,12 +123,12 @@ def _look(look: Method, place: int) -> dict[str, str]:
 
 
 def _finite(value: float) -> float | None:
-    """Return a number with four decimals, None for NaN."""
+    """Return a number with four decimals, or None for NaN."""
     return None if math.isnan(value) else round(float(value), 4)
 
 
 def _by_method(cells: pd.DataFrame) -> dict[str, Any]:
-    """Return our score, the paper's, and their difference, by method, of rows of a comparison."""
+    """Return our score, the paper's score, and their difference, by method, from the rows of a comparison."""
     found = {}
     for row in cells.to_dict("records"):
         ours = {"mean": _finite(row["mean"]), "std": _finite(row["std"])}
@@ -211,8 +211,8 @@ class Shown:
     Attributes:
         task: Name of the task.
         variant: Name of the variant.
-        runs: Best run of each method: its row of the table of runs.
-        film: Whether there is a film of the best run, which is the best one of its task.
+        runs: Best run of each method, as a row of the table of runs.
+        film: Whether there is a film of the best run, which is the best run of its task.
     """
 
     task: str
@@ -227,17 +227,17 @@ class Shown:
 
     @property
     def best(self) -> str:
-        """Method whose run has the highest score."""
+        """Method with the highest score."""
         return max(self.runs, key=lambda name: self.runs[name]["score"])
 
     @property
     def run(self) -> Mapping[str, Any]:
-        """Run of the method :attr:`best`."""
+        """Run of :attr:`best`."""
         return self.runs[self.best]
 
     @property
     def folder(self) -> Path:
-        """Folder of its pictures below that of the page."""
+        """Folder of the pictures, relative to the page."""
         # Repeated runs have the same configuration, but different actions.
         text = json.dumps([self.run["config_hash"], self.run["best_loss"], self.film])
         return Path("media") / f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"

@@ -15,7 +15,7 @@ from plab.config.suite import PAPER_SEEDS
 from plab.results import ResultsError
 
 PAPER_SEED_COUNT = len(PAPER_SEEDS)
-"""Number of runs of each configuration in the paper."""
+"""Number of runs per configuration in the paper."""
 
 
 @functools.cache
@@ -37,11 +37,11 @@ def paper_table(name: str) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark with a CSV file.
+    """A benchmark and its CSV file.
 
     Attributes:
         file: File name in a folder of benchmarks.
-        command: Command that generates it, with placeholders ``{file}`` and ``{folder}``.
+        command: Command that generates the file, with placeholders ``{file}`` and ``{folder}``.
         columns: Required columns.
     """
 
@@ -69,8 +69,8 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
     """Read a benchmark file; lines that begin with ``#`` describe its origin.
 
     Raises:
-        plab.results.ResultsError: If it is missing or invalid; the message names the command that generates
-            it.
+        plab.results.ResultsError: If the file is missing or invalid; the message names the command that
+            generates it.
     """
     advice = f"`{benchmark.command.format(file=path, folder=path.parent)}` makes it"
     try:
@@ -88,5 +88,5 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
 
 
 def origin(table: pd.DataFrame | None) -> list[str]:
-    """Return notes on the file of a table, if it was read from one."""
+    """Return notes on the source file of a table, if any."""
     return [] if table is None else [f"{line}." for line in table.attrs.get("origin", [])]

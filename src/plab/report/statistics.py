@@ -1,4 +1,4 @@
-"""Statistics of scores: means, confidence intervals, curves and equal budgets, and aggregates over a suite by
+"""Statistics of scores: means, confidence intervals, curves, equal budgets, and aggregates over a suite by
 stratified bootstrap.
 
 Interquartile mean and probability of improvement are those of Agarwal et al., Deep Reinforcement Learning at
@@ -29,12 +29,12 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Summary:
-    """Mean and spread of some numbers.
+    """Mean and spread of some values.
 
     Attributes:
-        mean: Mean; NaN without numbers.
-        std: Population standard deviation, as in the paper's tables; NaN without numbers.
-        count: Number of the numbers.
+        mean: Mean; NaN without values.
+        std: Population standard deviation, as in the paper's tables; NaN without values.
+        count: Number of values.
     """
 
     mean: float
@@ -44,7 +44,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its confidence interval, NaN for too few numbers."""
+    """A value with its confidence interval, NaN for too few samples."""
 
     value: float
     low: float
@@ -60,7 +60,7 @@ def summarise(values: Sequence[float] | np.ndarray) -> Summary:
 
 
 def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) -> Interval:
-    """Compare two sets of runs with the same strata (variants).
+    """Compare two sets of runs that have the same strata (variants).
 
     The difference is the mean over the strata of the differences of means. The interval is Welch's, with
     variances estimated within strata and Welch-Satterthwaite degrees of freedom. The rounding of the paper's
@@ -68,10 +68,10 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
 
     Args:
         ours: Mean, population standard deviation and count of each stratum.
-        theirs: The same, in the same order.
+        theirs: Likewise, in the same order.
 
     Returns:
-        Ours minus theirs, over common strata; without interval if a stratum has a single run.
+        Difference ours minus theirs over common strata; without interval if a stratum has a single run.
     """
     pairs = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.count and b.count]
     if not pairs:
@@ -81,7 +81,7 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
 
 
 def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
-    """Return a mean over ``count`` strata with its interval, from the contributions ``sides``."""
+    """Return a mean over ``count`` strata with its interval, given the contributions ``sides``."""
     if any(side.count < 2 for side in sides):
         return Interval(value, float("nan"), float("nan"))
     # Variance of a mean, from the population standard deviation.
@@ -103,7 +103,7 @@ RESAMPLES = 2000
 _SEED = 0
 
 Strata = Sequence[np.ndarray]
-"""Scores of each configuration's runs, shape [run] each."""
+"""Scores of the runs of each configuration, shape [run] each."""
 
 
 def interquartile_mean(strata: Strata) -> Interval:
@@ -151,8 +151,8 @@ def _interval(value: float, samples: np.ndarray) -> Interval:
 
 
 def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Return the scores of the runs by method, for the methods and configurations of :func:`common_strata`,
-    and notes on included and missing runs."""
+    """Return the scores of the runs by method, for the methods and configurations selected by
+    :func:`common_strata`, and notes on included and missing runs."""
     scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
     for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
         scores[name][task, variant] = own["score"].to_numpy(float)
@@ -166,7 +166,11 @@ def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
     notes = [
         f"Over the {len(keys)} configurations with runs of all methods shown; runs per method: "
         f"{', '.join(counts)}.",
-        *([f"Not shown, for lack of runs of these configurations: {', '.join(apart)}."] if apart else []),
+        *(
+            [f"Not shown, because runs of these configurations are missing: {', '.join(apart)}."]
+            if apart
+            else []
+        ),
         f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
     ]
     if any(len(scores) < 2 for own in strata.values() for scores in own):
@@ -177,17 +181,17 @@ def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
 def common_strata(
     scores: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
 ) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
-    """Return configurations with runs of several methods, and the scores of these methods.
+    """Return configurations for which several methods have runs, and the scores of these methods.
 
-    Methods are added in the order of the configurations that they share with the one that has most. As many
-    are selected as give the largest number of pairs of a method and a common configuration, at least two if
-    any share a configuration.
+    Methods are ordered by the number of configurations that they share with the method that has the most. The
+    selection maximises the number of pairs of a method and a common configuration, and has at least two
+    methods if any share a configuration.
 
     Args:
-        scores: By method and configuration, shape [run] each.
+        scores: Scores by method and configuration, shape [run] each.
 
     Returns:
-        The configurations; and by method the scores of each of them.
+        The configurations, and by method the scores of each configuration.
     """
     if not scores:
         return [], {}
@@ -209,7 +213,7 @@ BUDGETS = (1e3, 1e4, 1e5, 1e6)
 """Budgets at which methods are compared [environment steps]."""
 
 Rows = Mapping[str, np.ndarray]
-"""Columns of a run's iterations, as arrays, because thousands of pandas tables are slow to create."""
+"""Columns of a run's iterations, as arrays because creating thousands of pandas tables is slow."""
 
 Series = Sequence[tuple[dict[str, str], Rows]]
 """Task, variant, method and seed of each run, and its iterations."""
@@ -222,7 +226,7 @@ class Band:
     Attributes:
         x: Abscissae, increasing, shape [point].
         mean: Mean over the runs, shape [point].
-        std: Standard deviation over the runs, as a population, shape [point].
+        std: Population standard deviation over the runs, shape [point].
         count: Number of runs.
     """
 
@@ -242,8 +246,8 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
         Task, variant, method and seed of each run, and its iterations, with the columns of docs/results.md
         and some changes: ``seconds`` is the wall time since the start of the first row, ``simulated`` the
         simulated environment steps, ``substeps`` the simulated substeps, all at the end of the row;
-        ``best_score`` is the score of the best actions so far; ``episodes`` counts the row's own, too, so
-        that it starts at 1.
+        ``best_score`` is the score of the best actions so far; ``episodes`` includes the row's own episode,
+        so that it starts at 1.
     """
     names = runs.table[["task", "variant", "method", "seed"]].astype(str).to_dict("records")
     found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]))
@@ -280,7 +284,7 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
 def band(
     tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0, points: int = 400
 ) -> Band | None:
-    """Return mean and standard deviation of a column over runs, on the common range; a solved run keeps its
+    """Return mean and standard deviation of a column over runs, on their common range; a solved run keeps its
     score.
 
     Args:
@@ -316,13 +320,13 @@ def band(
 
 
 def scores_at(table: Rows, budgets: np.ndarray, column: str = "best_score") -> np.ndarray:
-    """Return a column of a run at some budgets [environment steps], NaN before its first row."""
+    """Return a column of a run at some budgets [environment steps], NaN before the first row."""
     row = np.searchsorted(np.asarray(table["simulated"], float), budgets, side="right") - 1
     return np.where(row < 0, np.nan, np.asarray(table[column], float)[row])
 
 
 def strata_of(series: Series, task: str) -> Mapping[str, list[list[Rows]]]:
-    """Return the iterations of a task's runs by method, those of one variant in a list."""
+    """Return the iterations of a task's runs by method, with one list per variant."""
     found: dict[str, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
     for names, table in series:
         if names["task"] == task and len(table["simulated"]):
@@ -331,7 +335,7 @@ def strata_of(series: Series, task: str) -> Mapping[str, list[list[Rows]]]:
 
 
 def at_budgets(strata: Sequence[Sequence[Rows]], budgets: np.ndarray) -> list[Interval]:
-    """Return the mean score of some runs, by variant in ``strata``, at each budget."""
+    """Return the mean score at each budget of some runs, given by variant in ``strata``."""
     values = [np.stack([scores_at(table, budgets) for table in runs]) for runs in strata]
     each = [[summarise(own[:, k]) for own in values] for k in range(len(budgets))]
     return [_around(float(np.mean([own.mean for own in one])), one, len(one)) for one in each]

@@ -1,6 +1,5 @@
-"""Tables of results: scores per task and configuration, solvability, equal budgets, times per step; and of
-hyper-parameters, read from ``conf/method/``.
-"""
+"""Tables of results: scores per task and configuration, solvability, equal budgets and times per step; and
+tables of hyper-parameters, read from ``conf/method/``."""
 
 from __future__ import annotations
 
@@ -44,17 +43,17 @@ MINUS = "\N{MINUS SIGN}"
 
 @dataclass(frozen=True)
 class Table:
-    """One table.
+    """A table of the report.
 
     Attributes:
-        name: Name of its files.
-        form: ``ours`` or ``comparison`` (with the paper): its folder.
+        name: Name of the files.
+        form: Folder: ``ours`` or ``comparison`` (with the paper).
         title: Heading.
         cells: Text of the table.
         data: CSV rows with all digits, one per number or group of numbers.
         bold: Mask of bold cells, of the shape of ``cells``; None without bold cells.
         notes: Notes on the contents and the provenance of the table.
-        long: Whether it may be longer than a page.
+        long: Whether the table may be longer than a page.
     """
 
     name: str
@@ -68,12 +67,12 @@ class Table:
 
     @property
     def file(self) -> Path:
-        """Path of its files below the folder of tables, without suffix."""
+        """Path of the files below the folder of tables, without suffix."""
         return Path(self.form) / self.name
 
 
 def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
-    """Format a number with a minus sign instead of a hyphen; a dash if it is missing."""
+    """Format a number with a minus sign instead of a hyphen; missing numbers become a dash."""
     if math.isnan(value):
         return NOTHING
     # Without a minus sign for values rounded to zero.
@@ -83,14 +82,14 @@ def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
 
 
 def aligned(cells: pd.DataFrame) -> list[str]:
-    """Return the alignment of each column: ``r`` for numbers, ``l`` otherwise."""
+    """Return the alignment of each column: ``r`` for numbers, otherwise ``l``."""
     columns = ([str(text) for text in cells.iloc[:, k]] for k in range(cells.shape[1]))
     known = ([text for text in texts if text not in ("", NOTHING)] for texts in columns)
     return ["r" if texts and all(map(_NUMBER.match, texts)) else "l" for texts in known]
 
 
 _NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
-"""Pattern of cells with numbers: a share of runs, an interval, a mean with its spread, a unit."""
+"""Pattern of numeric cells: a fraction of runs, an interval, a mean with its spread, a unit."""
 
 
 def mean_and_std(summary: Summary, decimals: int = 2) -> str:
@@ -106,7 +105,7 @@ _DIFFERENCE = (
     f"{CONFIDENCE:.0%} interval from the variances within variants; no interval if a variant has one run."
 )
 DISTANCES = {"chamfer": "Chamfer", "earth_movers": "earth mover's"}
-"""Headings of distances by their columns in results."""
+"""Headings of distances by result column."""
 
 INTERVAL = f"{CONFIDENCE:.0%} interval"
 """Heading of intervals."""
@@ -121,9 +120,9 @@ def compare(runs: Runs, unit: str) -> pd.DataFrame:
 
     Returns:
         Columns task, variant (if ``unit`` is ``configuration``), method; mean, std and runs of our scores,
-        and the expected number of runs; ``paper_mean``, ``paper_std`` and ``paper_runs``, for a part of a
-        method those of the whole method; difference (ours minus the paper's, for a task the mean over common
-        variants) with its interval, low and high.
+        and the expected number of runs; ``paper_mean``, ``paper_std`` and ``paper_runs`` (of the whole method
+        if it was split); and difference (ours minus the paper's, for a task the mean over common variants)
+        with its interval, low and high.
     """
     groups = runs.table.groupby(["task", "variant", "method"])["score"]
     scores = {key: own.to_numpy(float) for key, own in groups}
@@ -162,13 +161,13 @@ def _in_paper(name: str) -> bool:
 
 
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:
-    """Return tasks in the paper's order, others after them."""
+    """Return tasks in the paper's order, followed by other tasks."""
     papers = list(dict.fromkeys(paper_table("iou_per_configuration")["task"]))
     return sorted(tasks, key=lambda task: (papers.index(task) if task in papers else len(papers), task))
 
 
 def settings_note(runs: Runs) -> list[str]:
-    """Return notes on protocol and settings that differ from plab's."""
+    """Return notes on the protocol and on settings that differ from plab's."""
     protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
     if not runs.unusual:
         return protocol
@@ -182,7 +181,7 @@ def settings_note(runs: Runs) -> list[str]:
 
 
 def ends(interval: Interval, decimals: int = 2) -> str:
-    """Format an interval, a dash if there is none."""
+    """Format an interval; missing intervals become a dash."""
     if np.isnan(interval.low):
         return NOTHING
     return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
@@ -202,7 +201,7 @@ def iou_per_configuration(runs: Runs) -> list[Table]:
 
 
 def distances(runs: Runs) -> list[Table]:
-    """Return the distances of final shapes from their targets, per task and method; empty if no run has
+    """Return the distances of final shapes from their targets, per task and method, or nothing if no run has
     them."""
     shown, data = [], []
     for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), DISTANCES):
@@ -222,7 +221,7 @@ def distances(runs: Runs) -> list[Table]:
 
 
 def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
-    """Return both forms of a table of scores; ``what`` describes the runs of means and spreads."""
+    """Return both forms of a score table; ``what`` describes the runs behind means and spreads."""
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
     keys = ["task"] if unit == "task" else ["task", "variant"]
     data = compare(runs, unit)
@@ -256,13 +255,13 @@ def _text(mean: float, std: float, count: int, expected: int = 0) -> str:
 
 
 def _numbers(summary: Summary) -> dict[str, float]:
-    """Return values by column of a CSV file."""
+    """Return values for a CSV file by column."""
     return {"mean": summary.mean, "std": summary.std, "runs": summary.count}
 
 
 def _best(line: pd.DataFrame) -> list[bool]:
-    """Return the mask of the best methods per kind, compared as printed; no method if a cell is
-    incomplete."""
+    """Return the mask of the best methods per kind, comparing displayed values; no method is best if a cell
+    is incomplete."""
     best = pd.Series(False, line["method"])
     scores = line.set_index("method")
     for kind in (RL, GRADIENT):
@@ -285,11 +284,11 @@ AGREES = f"within two of the paper's standard deviations or {TOLERANCE:g} of its
 
 
 def compared_cells(runs: Runs) -> pd.DataFrame:
-    """Return the common cells, a row per task, variant and method.
+    """Return the common cells, one row per task, variant and method.
 
     Returns:
         Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
-        minus the paper's) and agrees (whether that is within two standard deviations or the tolerance).
+        minus the paper's) and agrees (whether it is within two standard deviations or the tolerance).
     """
     cells = compare(runs, "configuration").query("runs > 0 and paper_runs > 0").reset_index(drop=True)
     cells = cells.rename(columns={"mean": "ours", "paper_mean": "paper"})
@@ -300,7 +299,7 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
 
 
 def agreement(runs: Runs) -> list[Table]:
-    """Return the agreement per method, per kind of method and overall; empty without common cells."""
+    """Return the agreement per method, per kind of method and overall, or nothing without common cells."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
@@ -328,7 +327,7 @@ def agreement(runs: Runs) -> list[Table]:
 
 
 def in_all(cells: pd.DataFrame) -> dict[str, float]:
-    """Return the agreement of some of the :func:`compared_cells` as a whole.
+    """Return the overall agreement of some of the :func:`compared_cells`.
 
     Returns:
         Number of ``cells``, ``correlation`` (NaN without variation), mean ``distance``, mean ``difference``,
@@ -348,7 +347,7 @@ def in_all(cells: pd.DataFrame) -> dict[str, float]:
 
 
 def solvability(runs: Runs) -> list[Table]:
-    """Return the scores of the demonstrations beside those of the paper's best method."""
+    """Return the scores of the demonstrations next to those of the paper's best method."""
     grid = itertools.product(ordered_tasks(runs.tasks), runs.variants)
     paper = paper_table("iou_per_configuration")
     best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()]
@@ -356,7 +355,7 @@ def solvability(runs: Runs) -> list[Table]:
     data = pd.DataFrame(grid, columns=["task", "variant"]).merge(demonstration_scores(), "left")
     data = data.merge(best.rename(columns=names), "left").fillna({"paper_method": ""})
     columns = data[["score", "paper_mean", "paper_std"]].itertuples(index=False)
-    # A replay has no spread: all of the interval is the paper's.
+    # A replay has no spread, so the interval is the paper's.
     sides = [
         (Summary(score, 0.0, 2 * (score == score)), Summary(mean, std, PAPER_SEED_COUNT * (mean == mean)))
         for score, mean, std in columns
@@ -394,7 +393,7 @@ def demonstration_scores() -> pd.DataFrame:
 
 
 def score_at_budget(runs: Runs, series: Series) -> list[Table]:
-    """Return the table of scores at equal budgets, a row per task and method."""
+    """Return the table of scores at equal budgets, with one row per task and method."""
     budgets, rows, cells = np.array(BUDGETS), [], []
     for task in ordered_tasks(runs.tasks):
         strata = strata_of(series, task)
@@ -436,7 +435,7 @@ _TIMES = [
 
 
 def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Return times per environment step and task, beside the paper's.
+    """Return times per environment step and task, next to the paper's.
 
     Args:
         runs: Our runs.
@@ -509,7 +508,7 @@ _GRADIENT_KEYS = {
 
 
 def hyperparameters() -> list[Table]:
-    """Return the settings of all methods: ours beside the paper's."""
+    """Return the settings of all methods, next to the paper's."""
     # Composing needs Hydra.
     from plab.config import load_config
 

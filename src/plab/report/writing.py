@@ -1,4 +1,4 @@
-"""Files of all tables and all figures, with their origin: LaTeX, Markdown, CSV, PDF, PNG."""
+"""Output files of tables and figures with their origin: LaTeX, Markdown, CSV, PDF and PNG."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 
 def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | None = None) -> list[Table]:
-    """Write all tables as LaTeX and CSV, ``tables.tex`` and ``tables.md`` with all of them, and their origin.
+    """Write all tables as LaTeX and CSV; ``tables.tex`` and ``tables.md`` contain all of them, and their
+    origin.
 
     Args:
         runs: Our runs.
@@ -69,7 +70,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
 
 
 def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
-    """Draw all figures with data, and write them as PDF and PNG, with their notes and origin.
+    """Write all figures that have data as PDF and PNG, with their notes and origin.
 
     Args:
         runs: Our runs.
@@ -132,8 +133,8 @@ _TO_LATEX = str.maketrans(_LATEX_SIGNS)
 
 
 def latex(table: Table) -> str:
-    """Return a table environment for ``\\input``, which needs booktabs, graphicx, longtable; short tables are
-    scaled down to the width of the page."""
+    """Return a table environment for ``\\input``, which needs booktabs, graphicx and longtable; short tables
+    are scaled down to the width of the page."""
     cells = table.cells.map(lambda text: text.translate(_TO_LATEX))
     cells = cells.rename(columns=lambda text: text.translate(_TO_LATEX))
     style = cells.style.hide(axis="index")

@@ -237,7 +237,7 @@ def report(outcomes: Sequence[Outcome]) -> int:
     """Print a summary line of a sweep, and one line on standard error per run without a result; return the
     exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
     count = Counter(one.status for one in outcomes)
-    parts = [f"{count['finished']} finished", f"{count['before']} finished earlier"]
+    parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
     unfinished = ("failed", "refused", *_UNFINISHED)
     parts += [f"{count[status]} {_UNFINISHED.get(status, status)}" for status in unfinished if count[status]]
     print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)

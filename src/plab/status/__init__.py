@@ -1,4 +1,4 @@
-"""States of runs in folders and archives of results: done, running, interrupted, failed, missing."""
+"""States of runs in folders and archives of results: finished, running, interrupted, failed and missing."""
 
 from plab.status.survey import NAMES, STATES, Survey, survey
 

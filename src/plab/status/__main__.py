@@ -1,4 +1,4 @@
-"""``python -m plab.status``: the same as ``plab status``."""
+"""``python -m plab.status``: alias of ``plab status``."""
 
 from plab.cli.status import main
 

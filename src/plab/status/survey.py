@@ -33,15 +33,15 @@ _RECENT_ROWS = 20
 
 @dataclass(frozen=True)
 class Survey:
-    """State of the requested runs.
+    """State of requested runs.
 
     Attributes:
-        runs: A row per run, sorted by task, method, variant and seed: these names; ``state``; ``message``,
-            the reason of a failure; ``score``, of the best row so far if it is not finished; ``done`` and
-            ``total``, iterations or episodes (0 if unknown); ``rate``, their number per second; ``seconds``,
-            wall time so far; ``left``, remaining time [s] or its share of a batch; ``together``, number of
-            runs in its process; ``path``. NaN for unknown numbers.
-        others: Number of other runs in the results: not requested, or with other settings.
+        runs: One row per run, sorted by task, method, variant and seed, with these columns and ``state``;
+            ``message``, the reason for a failure; ``score``, of the best row so far if the run has not
+            finished; ``done`` and ``total``, iterations or episodes (0 if unknown); ``rate``, their number
+            per second; ``seconds``, wall time so far; ``left``, remaining time [s] or its share of a batch;
+            ``together``, number of runs in the process; ``path``. Unknown numbers are NaN.
+        others: Number of other runs in the results, which were not requested or have other settings.
         unreadable: Messages about files that could not be read.
         protocol: Name of the runs' protocol.
     """
@@ -54,7 +54,7 @@ class Survey:
     @property
     def groups(self) -> pd.DataFrame:
         """Number of runs, ``expected`` and in each of :data:`STATES`, by task and method; mean ``score`` and
-        ``mean_seconds`` of finished runs, and ``rate``; ``left``, remaining time with one worker [s]."""
+        ``mean_seconds`` of finished runs; ``rate``; and ``left``, the remaining time with one worker [s]."""
         runs = self.runs.assign(**{state: self.runs["state"] == state for state in STATES})
         done = runs["state"] == "done"
         runs = runs.assign(mean_seconds=runs["seconds"].where(done), score=runs["score"].where(done))
@@ -71,13 +71,12 @@ class Survey:
 
     @property
     def workers(self) -> int:
-        """Number of active processes; runs of a batch share one."""
+        """Number of active processes; the runs of a batch share one."""
         return max(round((1.0 / self.running["together"]).sum()), 1) if len(self.running) else 0
 
     @property
     def eta(self) -> float | None:
-        """Remaining time until all runs are finished [s], with the current number of processes; None if
-        unknown."""
+        """Remaining time until all runs have finished [s], with the current number of processes, or None."""
         left = float(self.runs["left"].sum(skipna=False))
         if not self.workers or math.isnan(left):
             return None
@@ -90,10 +89,10 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     """Find the state of the requested runs.
 
     Args:
-        source: Folder of results, archive, or several.
+        source: Folder of results, archive, or several of them.
         chosen: Selection of runs: all combinations of its values with the existing values of other keys.
-        missing: Include all tasks and variants of the suite not restricted by ``chosen``, with the methods
-            and seeds of the results, or the paper's if there are none.
+        missing: Whether to include all tasks and variants of the suite that ``chosen`` does not exclude, with
+            the methods and seeds of the results, or the paper's if there are none.
 
     Raises:
         ResultsError: If ``source`` does not exist, or is an unreadable file or archive.
@@ -108,7 +107,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     for key, row in zip(keys, fitting, strict=True):
         run, state = runs.get(key), _state(row)
         others += run is None or run["state"] != "missing"
-        # Among several settings of the same run the best one counts.
+        # Among several settings of the same run, the one with the best state counts.
         if run is not None and STATES.index(state) < STATES.index(run["state"]):
             runs[key] = run | _described(row, state)
     protocol = one_protocol(row.config for row in fitting)
@@ -153,7 +152,7 @@ def _described(row: Row, state: str) -> dict[str, Any]:
 
 
 def _measured(path: Path, total: int) -> dict[str, Any]:
-    """Return progress, speed and time left of a run in progress, estimated from its latest rows."""
+    """Return progress, speed and remaining time of a run in progress, estimated from its latest rows."""
     try:
         with opened(path) as file:
             table, summary = columns_of(file), summary_of(file)
@@ -179,7 +178,7 @@ def _measured(path: Path, total: int) -> dict[str, Any]:
 
 
 def _with_estimates(table: pd.DataFrame) -> pd.DataFrame:
-    """Estimate the remaining time of runs without a known speed from finished ones of the same task and
+    """Estimate the remaining time of runs with unknown speed from finished runs of the same task and
     method."""
     done = table["state"] == "done"
     mean = table["seconds"].where(done).groupby([table["task"], table["method"]]).transform("mean")

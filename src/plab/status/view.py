@@ -1,4 +1,4 @@
-"""Views of a survey: a table of groups, and all runs live."""
+"""Views of a survey: a table of groups, and a live view of all runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def duration(seconds: float) -> str:
 
 
 def show(found: Survey) -> None:
-    """Print a table by task and method, the running and failed runs, and totals."""
+    """Print a table by task and method, running and failed runs, and totals."""
     console = Console() if sys.stdout.isatty() else Console(width=80)
     table = _table("task", "method", "done", "not done", "score", "mean time", "time left")
     for group in found.groups.itertuples():
@@ -49,7 +49,7 @@ def show(found: Survey) -> None:
             lines.append(f"failed: {_name(run)}: {run.message}")
     lines += _sums(found)
     if found.others:
-        lines.append(f"{found.others} further run(s) in the results, of other names or other settings")
+        lines.append(f"{found.others} other run(s) in the results, with other names or settings")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for error in found.unreadable:
@@ -64,7 +64,7 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
     """
     console = Console()
     if not console.is_terminal:
-        raise ArgumentError("--watch needs a terminal: leave it out, or use --json")
+        raise ArgumentError("--watch needs a terminal: omit it, or use --json")
     with Live(console=console, auto_refresh=False) as live:
         while True:
             found = look()
@@ -75,8 +75,8 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
 
 
 def _screen(found: Survey) -> Group:
-    """Return totals, and a table with a line per run, runs in progress first, which Rich cuts off at the end
-    of the screen."""
+    """Return totals, and a table with one line per run, runs in progress first, which Rich cuts off at the
+    end of the screen."""
     table = _table("run", "state", "done", "score", "rate", "time left")
     for run in sorted(found.runs.itertuples(), key=lambda run: list(_COLOURS).index(run.state)):
         state = f"[{_COLOURS[run.state]}]{run.state}[/]" + (f": {escape(run.message)}" if run.message else "")

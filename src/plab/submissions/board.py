@@ -1,4 +1,4 @@
-"""Tables of the leaderboard: comparable entries, and the paper's numbers."""
+"""Leaderboard tables: comparable entries, and the paper's numbers."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, A
     Returns:
         Tables for the page, each with ``title``, ``protocol`` (conditions of the scores, in sentences),
         ``expected`` (number of configurations) and ``lines`` of :func:`_line`, best first; and a message for
-        each file that is in none of them.
+        each file that is not in any table.
 
     Raises:
-        SubmissionError: If there is no such folder.
+        SubmissionError: If the folder does not exist.
         plab.config.ConfigError: If an override is invalid.
     """
     if not folder.is_dir():
@@ -61,7 +61,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> tuple[list[dict[str, A
                 lines[kind].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    played = "Score of one episode in the hard contact model, of the plan or policy handed in; protocol=plab"
+    played = "Score of one episode of the submitted plan or policy in the hard contact model; protocol=plab"
     sections = [
         _table(title, f"{played}, {what}.", variants, lines[kind])
         for kind, (title, what, variants) in _TABLES.items()
@@ -116,11 +116,11 @@ def _submission_lines(path: Path, overrides: Sequence[str]) -> Iterator[tuple[st
     """Yield the lines of a submission with their tables.
 
     Raises:
-        ResultsError: If it belongs to no table.
+        ResultsError: If the submission does not belong to any table.
     """
     submission = read(path)
     if submission.card is None:
-        raise SubmissionError(f"{path} has no card: plab submit makes a submission of recordings")
+        raise SubmissionError(f"{path} has no card: use plab submit to turn recordings into a submission")
     configs_of(submission, overrides)
     verdicts, status = read_verification(submission), "claimed"
     if wrong := [one for one in verdicts if one.outcome in (LIES, BROKE_OFF)]:

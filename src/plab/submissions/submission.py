@@ -1,4 +1,5 @@
-"""Submissions: plans or policies with claimed scores, a card that describes the method, and their files.
+"""Submissions: plans or policies with claimed scores, a card that describes the method, and their file
+format.
 
 Nothing in a file is executed, and its size is checked before unpacking.
 """
@@ -30,13 +31,13 @@ from plab.results.run_file import explained, replace_file
 from plab.targets.build import PHYSICS_VERSION
 
 SUFFIX = ".plabsub.zip"
-"""End of the names of submissions."""
+"""Suffix of submissions."""
 
 FORMAT = 2
-"""Version of the layout; files of another one are not read."""
+"""Version of the layout; files with another version are rejected."""
 
 UNSEEN = tuple(f"random{seed}" for seed in range(9000, 9010))
-"""Variants of every task reserved for evaluation: ``variant=random`` with these ``seed_scene``."""
+"""Variants of every task reserved for evaluation: ``variant=random`` with these values of ``seed_scene``."""
 
 VARIANTS = (*SUITE_VARIANTS, *UNSEEN)
 
@@ -47,7 +48,7 @@ _CARD, _MANIFEST = "card.yaml", "manifest.json"
 
 
 class SubmissionError(ResultsError):
-    """A submission cannot be read, written or verified; the message is one line."""
+    """Submission that cannot be read, written or verified; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Card:
         budget: Total number of simulated environment steps, including tuning.
         hardware: Hardware used.
         gradient: Whether the simulator's gradient was used.
-        description: The method in a sentence or two; optional.
+        description: Description of the method in a sentence or two; optional.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Card:
 
 @dataclass(frozen=True, order=True)
 class Configuration:
-    """Task and variant of an entry, of plab's protocol and targets.
+    """Task and variant of an entry, with plab's protocol and targets.
 
     Attributes:
         task: Name of the task.
@@ -91,7 +92,7 @@ class Configuration:
         return f"{self.task}-v{self.variant}"
 
     def config(self, overrides: Sequence[str] = ()) -> Config:
-        """Compose its configuration, with overrides such as ``sim.device=cuda``."""
+        """Compose the configuration, with overrides such as ``sim.device=cuda``."""
         variant = [f"variant={self.variant}"]
         if self.variant in UNSEEN:
             variant = ["variant=random", f"seed_scene={self.variant.removeprefix('random')}"]
@@ -99,7 +100,7 @@ class Configuration:
 
 
 def configuration_of(cfg: Config) -> Configuration:
-    """Return the leaderboard's name for a configuration.
+    """Return the leaderboard's name of a configuration.
 
     Raises:
         SubmissionError: If the leaderboard has no such configuration.
@@ -115,8 +116,8 @@ def configuration_of(cfg: Config) -> Configuration:
 
 
 def checksum(cfg: Config) -> str:
-    """Return the SHA-256, in hex, of what determines a score beside the actions: bodies, manipulators,
-    material, discretisation, horizon, and recipe of the target."""
+    """Return the SHA-256, in hex, of all data that determine a score in addition to the actions: bodies,
+    manipulators, material, discretisation, horizon and target recipe."""
     facts = {"scene": build_scene(cfg).facts(), "target": cfg.task.target}
     text = json.dumps(facts, sort_keys=True, default=attrgetter("sha256"))
     return hashlib.sha256(text.encode()).hexdigest()
@@ -124,15 +125,15 @@ def checksum(cfg: Config) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """One plan, or one policy, for one configuration.
+    """A plan or a policy for one configuration.
 
     Attributes:
-        configuration: Its configuration.
-        checksum: :func:`checksum` of its configuration.
-        steps: Number of environment steps simulated until it was found, with or without gradient.
+        configuration: The configuration.
+        checksum: :func:`checksum` of the configuration.
+        steps: Number of environment steps simulated to find it, with or without gradient.
         score: Claimed score in the hard contact model, in [0, 1].
-        actions: The plan, in [-1, 1], shape [T, A]; None for a policy.
-        policy: Name of the policy's file; empty for a plan.
+        actions: Actions of the plan, in [-1, 1], shape [T, A]; None for a policy.
+        policy: Name of the policy file; empty for a plan.
     """
 
     configuration: Configuration
@@ -144,22 +145,22 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """Name in messages."""
+        """Name for messages."""
         return f"{self.configuration.name} after {self.steps:,} steps"
 
 
 @dataclass(frozen=True)
 class Submission:
-    """Content of a file.
+    """Content of a submission file.
 
     Attributes:
-        card: The method; None in recordings.
+        card: Description of the method; None in recordings.
         entries: Plans, or policies.
         policies: Files of the policies, by name.
         plab: Version of plab that wrote the file.
         physics: Version of the physics, :data:`plab.targets.build.PHYSICS_VERSION`.
         path: The file.
-        digest: SHA-256 of its file, in hex; empty if it was not read from a file.
+        digest: SHA-256 of the file, in hex; empty if the submission was not read from a file.
     """
 
     card: Card | None
@@ -190,7 +191,7 @@ def _require(fits: bool, fault: str) -> None:
 
 
 def parse_card(text: bytes, source: str) -> Card:
-    """Read a card, YAML in UTF-8; messages name its ``source``.
+    """Parse a card, YAML in UTF-8; messages name its ``source``.
 
     Raises:
         SubmissionError: If it is not valid YAML or has errors.
@@ -248,10 +249,11 @@ def encode(submission: Submission) -> bytes:
 
 
 def read(path: str | Path) -> Submission:
-    """Read a submission, without executing anything or verifying its claims.
+    """Read a submission without executing anything or verifying its claims.
 
     Raises:
-        plab.results.ResultsError: If the file is missing, cut off, too large, of another layout or malformed.
+        plab.results.ResultsError: If the file is missing, truncated, too large, malformed or has another
+            layout.
     """
     path = Path(path)
     with explained(path):
@@ -272,7 +274,7 @@ def read(path: str | Path) -> Submission:
 
 
 def excess(submission: Submission) -> str | None:
-    """Return a message if the entries took more steps than the card's budget; None if they did not."""
+    """Return a message if the entries took more steps than the card's budget, otherwise None."""
     # A policy is trained once for all its configurations, a plan for a single one.
     spent: dict[Any, int] = defaultdict(int)
     for entry in submission.entries:
@@ -285,8 +287,8 @@ def excess(submission: Submission) -> str | None:
 
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
-    """Return an entry of the manifest with its actions; raise ValueError, KeyError or TypeError for
-    mistakes."""
+    """Return an entry of the manifest with its actions; raise ValueError, KeyError or TypeError for errors in
+    it."""
     configuration = Configuration(record["task"], record["variant"])
     known = configuration.task in suite_tasks() and configuration.variant in VARIANTS
     _require(known, f"{where}: the leaderboard has no {configuration}")

@@ -1,5 +1,5 @@
-"""Verification of submissions by simulating all claims again, and their entries: episodes of an agent,
-results of plab, policies.
+"""Verification of submissions by repeated simulation, and sources of their entries: episodes of an agent,
+results of plab, and policies.
 
 Policies are TorchScript or ONNX. Loading a policy executes it, so this happens only on request.
 """
@@ -58,13 +58,13 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcome of a claim.
+    """Outcome of verifying a claim.
 
     Attributes:
         entry: The claim.
-        score: Simulated score, NaN if it was not run or diverged.
+        score: Simulated score, NaN if the entry was not run or diverged.
         outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
-        why: One-line reason, empty if it holds.
+        why: One-line reason, empty if the claim holds.
     """
 
     entry: Entry
@@ -84,8 +84,7 @@ def verify(
         A verdict for each entry, in the order of the file.
 
     Raises:
-        SubmissionError: If its physics, scenes or targets differ, or its plans or policies do not fit their
-            tasks.
+        SubmissionError: If physics, scenes or targets differ, or plans or policies do not fit their tasks.
         plab.config.ConfigError: If an override is invalid.
     """
     cfgs = configs_of(submission, overrides)
@@ -109,7 +108,7 @@ def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configu
     """Compose the configurations of a submission.
 
     Raises:
-        SubmissionError: If its physics, a scene or a target differ from this plab's with the overrides.
+        SubmissionError: If the physics, a scene or a target differs from this plab's with the overrides.
         plab.config.ConfigError: If an override is invalid.
     """
     versions = f"({submission.plab}, this is {plab.__version__})"
@@ -123,8 +122,8 @@ def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configu
         found[entry.configuration], known = _composed(entry.configuration, tuple(overrides))
         if entry.checksum != known:
             raise SubmissionError(
-                f"{submission.path}: the scene or target of {entry.configuration.name} is another one than "
-                f"here: give the overrides that it was made with, or use its plab {versions}"
+                f"{submission.path}: the scene or target of {entry.configuration.name} differs from "
+                f"the one here: use the overrides that it was made with, or its plab {versions}"
             )
     return found
 
@@ -158,7 +157,7 @@ def play(
         name: Name of the policy in messages.
 
     Returns:
-        Score of each episode's last state, and an empty text; after a divergence NaN and the reason.
+        Score of each episode's last state, and an empty string; after a divergence NaN and the reason.
 
     Raises:
         SubmissionError: If a plan has a wrong shape, or the policy cannot be run, returns invalid actions, or
@@ -197,10 +196,10 @@ def play(
 def load_policy(name: str, content: bytes) -> Policy:
     """Load a policy, TorchScript (``.pt``) or ONNX (``.onnx``) according to its suffix.
 
-    It returns one finite action in [-1, 1] per observation, or raises SubmissionError.
+    The policy returns one finite action in [-1, 1] per observation, or raises SubmissionError.
 
     Raises:
-        SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.
+        SubmissionError: If the policy cannot be loaded, or ONNX Runtime is missing.
     """
     if name.endswith(".onnx") and find_spec("onnxruntime") is None:
         raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
@@ -259,7 +258,7 @@ def write_verification(verdicts: Sequence[Verdict], submission: Submission, over
     """Write the verification file beside a submission; return its path.
 
     Raises:
-        plab.results.ResultsError: If it cannot be written.
+        plab.results.ResultsError: If the file cannot be written.
     """
     path = _beside(submission)
     assert path is not None
@@ -275,7 +274,7 @@ def write_verification(verdicts: Sequence[Verdict], submission: Submission, over
 
 
 def read_verification(submission: Submission) -> list[Verdict]:
-    """Return the verdicts on a submission; empty if this file was not verified with the current physics.
+    """Return the verdicts on a submission, or none if its file was not verified with the current physics.
 
     Raises:
         plab.results.ResultsError: If the verification file cannot be read.
@@ -301,7 +300,7 @@ Env = TypeVar("Env")
 
 
 class _BestEpisodes:
-    """Best episodes of one configuration, one within each budget, in a file.
+    """Best episodes of one configuration, one per budget, in a file.
 
     Attributes:
         steps: Environment steps simulated so far.
@@ -325,13 +324,13 @@ class _BestEpisodes:
             with path.open("xb") as file:
                 file.write(encode(Submission(None, ())))
         except FileExistsError:
-            why = "is there already: record into another folder, or remove it"
+            why = "already exists: record into another folder, or remove it"
             raise SubmissionError(f"{path} {why}") from None
         except OSError as error:
             raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
     def add(self, actions: np.ndarray, score: float) -> None:
-        """Add an episode: its actions, shape [T, A], and score."""
+        """Add an episode, given its actions, shape [T, A], and score."""
         better = [
             limit
             for limit in (*BUDGETS, math.inf)
@@ -361,16 +360,15 @@ def record(env: Env, folder: str | Path) -> Env:
         The same environment.
 
     Raises:
-        SubmissionError: If the environment cannot be recorded, or the folder has a recording of another
-            process.
+        SubmissionError: If the environment cannot be recorded, or the folder has another process's recording.
         plab.results.ResultsError: If the file cannot be written.
     """
     inner = getattr(env, "unwrapped", None)
     batch = getattr(inner, "batch", None)
     if not isinstance(batch, EpisodeBatch):
-        raise SubmissionError(f"{type(inner).__name__} is no environment of plab's")
+        raise SubmissionError(f"{type(inner).__name__} is not a plab environment")
     if batch.contact != "hard":
-        raise SubmissionError("the contact model is soft: scores are of the hard one")
+        raise SubmissionError("the contact model is soft, but scores need the hard one")
     ledgers = []
     for cfg in batch.configs:
         path = Path(folder).resolve() / f"{configuration_of(cfg).name}{SUFFIX}"
@@ -410,7 +408,7 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
     results, sorted by configuration.
 
     Raises:
-        SubmissionError: If there are none, or duplicates.
+        SubmissionError: If there are no plans, or duplicates.
         plab.results.ResultsError: If a file cannot be read.
     """
     found: dict[Configuration, Path] = {}
@@ -428,7 +426,7 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
             for entry in own:
                 other, name = found.setdefault(entry.configuration, path), entry.configuration.name
                 if other != path:
-                    both = f"{path} and {other} are both of {name}"
+                    both = f"{path} and {other} are both for {name}"
                     raise SubmissionError(f"{both}: submit one training of each")
             entries += own
     if not entries:
@@ -450,16 +448,16 @@ def _of_run(row: Row) -> Entry:
 def from_policies(
     policies: Mapping[str, Path], variants: Sequence[str], steps: int, overrides: Sequence[str]
 ) -> tuple[list[Entry], dict[str, bytes]]:
-    """Run policies, and collect their episodes.
+    """Run policies and collect their episodes.
 
     Args:
-        policies: Files of TorchScript (``.pt``) or ONNX (``.onnx``), by task. They are executed.
-        variants: Variants to act in.
-        steps: Environment steps of the training of each policy.
-        overrides: Overrides of every configuration.
+        policies: TorchScript (``.pt``) or ONNX (``.onnx``) files by task. They are executed.
+        variants: Variants to run the policies in.
+        steps: Environment steps used to train each policy.
+        overrides: Overrides for every configuration.
 
     Returns:
-        The entries, and the files by their names in the submission.
+        The entries, and the policy files by name in the submission.
 
     Raises:
         SubmissionError: If a policy cannot be read or run, or the simulation diverges.

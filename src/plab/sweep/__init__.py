@@ -1,4 +1,4 @@
-"""Sweeps: execution of many runs in batches that share a simulator.
+"""Sweeps: batched execution of many runs that share a simulator.
 
 Nothing is imported here, so that the command line starts without torch.
 """

@@ -1,4 +1,4 @@
-"""Sweeps: composition of all combinations of values, batching, execution, and outcomes."""
+"""Sweeps: composition of all combinations of values, batching, execution and outcomes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from plab.targets import TargetError
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
-"""Function that executes batches, given a text for progress, and yields outcomes."""
+"""Function that executes batches, given a progress text, and yields outcomes."""
 
 
 def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = None) -> int:
@@ -57,17 +57,17 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         words: Prepared overrides.
         master: Configuration with Hydra's section, which has the parameters of an experiment and the settings
             of the launcher.
-        config_dir: Folder with files of the user's own.
+        config_dir: Folder with the user's files.
 
     Returns:
         Exit code: 0 if all results exist, 2 if a run was rejected, otherwise 1.
 
     Raises:
-        ConfigError: If the overrides give no runs, or all runs are rejected for the same reason.
+        ConfigError: If the overrides define no runs, or all runs are rejected for the same reason.
     """
     if not master.hydra.sweeper["_target_"].endswith(".BasicSweeper"):
         raise ConfigError(
-            "hydra/sweeper: plab runs all combinations; search by plab.runners.run_config in Python"
+            "hydra/sweeper: plab runs all combinations; to search, call plab.runners.run_config in Python"
         )
     settings = _launcher_settings(master.hydra.launcher)
     jobs = jobs_of(words, master.hydra.sweeper.params or {}, config_dir)
@@ -130,8 +130,8 @@ def jobs_of(
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
-    """Compose and check the runs of a sweep, given prepared overrides of each; return the configuration of
-    each, or its error. Shared parts are checked once."""
+    """Compose and check the runs of a sweep, given prepared overrides for each; return a configuration or an
+    error for each. Shared parts are checked once."""
     finished: dict[tuple[str, ...], Config | str] = {}
     entries: list[Config | Outcome] = []
     for job in jobs:
@@ -149,7 +149,7 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
 
 
 def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
-    """Return a configuration, or the error in it, in the scene or the target."""
+    """Return a configuration, or the error in the configuration, its scene or its target."""
     try:
         cfg = finish(compose(words, config_dir), words, alone=False)
         check_sources(cfg)
@@ -164,7 +164,7 @@ def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
 def plan(
     cfgs: Sequence[Config], size: int | None = None, processes: int = 1, sharing: int = 1
 ) -> list[list[Config]]:
-    """Put configurations into batches.
+    """Divide configurations into batches.
 
     Runs of one task share a batch if their methods differ only in optimiser and contact model, or are equal
     learning methods; variants, seeds and materials may differ. Runs of other methods form batches of one,
@@ -223,9 +223,9 @@ def _limit(cfg: Config, size: int | None, sharing: int) -> int:
 def run_batches(
     cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1, sharing: int = 1
 ) -> Iterator[Outcome]:
-    """Execute the unfinished runs of a sweep, and yield outcomes.
+    """Execute the unfinished runs of a sweep and yield outcomes.
 
-    Runs in progress in other processes are skipped. If that process ends early, they are resumed here. Other
+    Runs in progress in other processes are skipped, and resumed here if such a process ends early. Other
     arguments are those of :func:`plan`.
     """
     # Duplicates count once.
@@ -264,13 +264,13 @@ def _carry_elsewhere(
     batches: list[list[Config]],
     _progress: Callable[[], str],
 ) -> Iterator[Outcome]:
-    """Submit batches to a launcher of Hydra, one job each, given the overrides of each run by file."""
+    """Submit batches to a Hydra launcher, one job each, given the overrides of each run by file."""
     config = deepcopy(master)
     with open_dict(config.hydra):
         config.hydra.launcher = inner
     name = inner["_target_"].rpartition(".")[2]
     runs = sum(len(batch) for batch in batches)
-    alone = "; hydra.launcher.batch_size=1 makes a job of each" if runs > len(batches) == 1 else ""
+    alone = "; hydra.launcher.batch_size=1 submits one job per run" if runs > len(batches) == 1 else ""
     print(f"{runs} runs go to {name} in {len(batches)} jobs{alone}", flush=True)
     try:
         launcher = Plugins.instance().instantiate_launcher(
@@ -289,7 +289,7 @@ def _carry_elsewhere(
 
 
 def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Outcome]:
-    """Execute the batch of a launcher's job, in its process."""
+    """Execute a batch in the process of a launcher's job."""
     number = HydraConfig.get().job.num
     note = f"[batch {number + 1}/{len(batches)}] " if len(batches) > 1 else ""
     return runners.run_batch(batches[number], note, SimulatorCache())
@@ -305,10 +305,10 @@ def look_up(cfg: Config) -> Outcome:
     try:
         left = read(path.with_suffix(PARTIAL_SUFFIX))
     except ResultsError:
-        return Outcome.of(cfg, "lost", message="no result, and no process computes it now")
+        return Outcome.of(cfg, "lost", message="no result, and no process is computing it")
     if left.status == "failed":
         return Outcome.of(cfg, "failed", message=left.message)
-    return Outcome.of(cfg, "lost", message=f"{left.rows} iterations, and no process computes it now")
+    return Outcome.of(cfg, "lost", message=f"{left.rows} iterations, and no process is computing it")
 
 
 def _finished_before(cfg: Config) -> Outcome | None:
@@ -327,13 +327,13 @@ def _finished_before(cfg: Config) -> Outcome | None:
 
 @contextmanager
 def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Carrier, int]]:
-    """Start ``per_gpu`` processes on each GPU, at most ``most`` in all, for the duration of the ``with``
-    block; yield a function that executes batches with them, and their number. Raise ConfigError if there is
-    no GPU."""
+    """Start ``per_gpu`` processes on each GPU, at most ``most`` in total, for the duration of the ``with``
+    block; yield a function that executes batches with them, and their number. Raise ConfigError if there
+    is no GPU."""
     named = os.environ.get(VISIBLE)
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):
-        raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
+        raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; omit it")
     # Processes are distributed evenly over GPUs.
     places = names * per_gpu
     pools = [_pool(name) for name in places[:most]]
@@ -355,7 +355,7 @@ def _dispatch(
     batches: list[list[Config]],
     progress: Callable[[], str],
 ) -> Iterator[Outcome]:
-    """Give batches to free processes, and yield the outcomes."""
+    """Assign batches to free processes, and yield the outcomes."""
     waiting, free = list(batches), list(range(len(pools)))
     running: dict[Future[list[Outcome]], tuple[int, list[Config]]] = {}
     while waiting or running:
@@ -369,12 +369,12 @@ def _dispatch(
             try:
                 yield from future.result()
             except BrokenProcessPool:
-                # Killed: the result files have its progress.
+                # After a kill, the result files have the progress.
                 pools[number] = _pool(places[number])
                 yield from map(look_up, batch)
 
 
-# Inside the processes.
+# Code below runs in the worker processes.
 _cache = SimulatorCache()
 
 

@@ -27,7 +27,7 @@ _HEIGHT = 480
 
 @dataclass(frozen=True)
 class Viewer:
-    """A rollout in 3-D, displayed by notebooks as the result of a cell.
+    """Rollout in 3-D, which notebooks display as the result of a cell.
 
     Attributes:
         page: HTML page, as written by ``plab view``.
@@ -40,7 +40,7 @@ class Viewer:
     height: int = _HEIGHT
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame, isolated from the notebook's styles and scripts."""
+        """Return the page in a frame that isolates it from the notebook's styles and scripts."""
         style = f"width: 100%; height: {self.height}px; border: 0"
         return f'<iframe title="rollout in 3-D" style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
@@ -64,23 +64,23 @@ def show(
             its task, or zeros.
         every: Environment steps between frames, interpolated by the viewer; default: at most 60
             frames.
-        surface: Show plasticine as smooth surfaces instead of its particles.
+        surface: Whether to show plasticine as smooth surfaces instead of particles.
         height: Height of the viewer [pixels].
 
     Raises:
-        RenderError: If K3D-jupyter or PyVista is not installed, the file has no actions yet or is given
-            others, or the actions do not fit the scene.
+        RenderError: If K3D-jupyter or PyVista is not installed, the file has no actions yet, actions are
+            given for a file, or the actions do not fit the scene.
         plab.results.ResultsError: If the file cannot be read.
     """
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
-    # Imported here: they load the simulator, for which no mistake above should have to wait.
+    # Imported here, because they load the simulator, which should not delay error messages.
     from plab.render import rollouts
     from plab.sim.runtime import in_use
     from plab.view.page import page
 
     if isinstance(what, str | PathLike):
         if actions is not None:
-            raise RenderError("a result file has its own actions: give actions with a configuration only")
+            raise RenderError("a result file has its own actions: pass actions only with a configuration")
         cfg, actions = rollouts.result(Path(what))
     else:
         cfg = what

@@ -1,4 +1,4 @@
-"""``python -m plab.view``: the same as ``plab view``."""
+"""``python -m plab.view``: alias of ``plab view``."""
 
 from plab.cli.rollouts import view
 

@@ -1,4 +1,4 @@
-"""3-D pages: particles, manipulators and target as objects of K3D-jupyter, with playback controls."""
+"""3-D pages: particles, manipulators and target as K3D-jupyter objects, with playback controls."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
     Args:
         recording: The rollout.
         every: Environment steps between frames, with interpolated particles; default: at most 60 frames.
-        surface: Show plasticine as smooth surfaces instead of its particles.
+        surface: Whether to show plasticine as smooth surfaces instead of particles.
     """
     last = len(recording.x) - 1
     every = every or max(1, -(-last // _FRAMES))
@@ -102,7 +102,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
 
 
 def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
-    """Return an index of pages, given by name, file and score; the first is open."""
+    """Return an index of pages, given by name, file and score; the first page is open."""
     return _template("gallery.html").render(pages=pages)
 
 
