@@ -1,4 +1,4 @@
-"""A real browser for the tests of pages; skipped where there is none."""
+"""Browser fixture for tests of pages; skipped without a browser."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def browser() -> Iterator:
 
 
 def until(browser, script: str) -> None:
-    """Wait until a condition in the page is true; the script's own limit is selenium's, a minute."""
+    """Wait until a condition in the page is true; selenium limits scripts to one minute."""
     wait = (
         "const done = arguments[0]; const look = () => (SCRIPT) ? done(true) : setTimeout(look, 30); look();"
     )

@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests; those marked ``gpu`` are skipped where there is no CUDA device."""
+"""Fixtures shared by all tests; tests marked ``gpu`` are skipped without a CUDA device."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ OF_ANY_DEVICE = (
     "tests/test_mixed_materials.py",
     "tests/verification/",
 )
-"""Tests of the simulator that need a GPU where they are to run on one."""
+"""Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
 
 @pytest.fixture(scope="session")
 def device() -> str:
-    """Device on which the simulator's tests run: ``PLAB_TEST_DEVICE``, cpu unless set."""
+    """Device of the simulator's tests: ``PLAB_TEST_DEVICE``, by default cpu."""
     return DEVICE
 
 
@@ -45,14 +45,14 @@ def _simulators_of_one_module(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the index of the tests' results out of the user's cache folder."""
+    """Keep the index of test results out of the user's cache folder."""
     folder = tmp_path_factory.getbasetemp() / "cache"
     monkeypatch.setattr("plab.results.table.cache_dir", lambda: folder)
 
 
 @pytest.fixture(autouse=True)
 def _own_logging() -> Iterator[None]:
-    """Undo what Hydra configures for the whole process."""
+    """Undo Hydra's configuration of process-wide logging."""
     root = logging.getLogger()
     level, disabled = root.level, logging.root.manager.disable
     yield
@@ -65,7 +65,7 @@ def _own_logging() -> Iterator[None]:
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
-    """Collect the configurations that reach the runners, instead of running them."""
+    """Collect the configurations passed to the runners, instead of running them."""
     configs: list[Config] = []
 
     def collect(cfg: Config, cache: SimulatorCache | None = None) -> float:
@@ -82,7 +82,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 
 @pytest.fixture
 def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Call a command line that has to refuse, assert that the folder is unchanged, and return the line."""
+    """Call a command line that must be refused, assert an unchanged folder, and return the message."""
     from plab.cli.run import main
 
     def call(
@@ -103,7 +103,7 @@ def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., st
 
 @pytest.fixture
 def refused(seen: list[Config], told: Callable[..., str]) -> Callable[..., str]:
-    """The same as ``told``, and no configuration reaches the runners."""
+    """Like ``told``, and assert that no configuration reaches the runners."""
 
     def call(*args: object, **kwargs: object) -> str:
         line = told(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Rollouts for the tests on CUDA: moving, strained starts, random targets, and all their results."""
+"""Rollouts for CUDA tests with moving, strained initial states and random targets, and their results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def simulator_of(
     device: str = "cuda",
     deterministic: bool = True,
 ) -> Simulator:
-    """A simulator of some scenes, partly strained beyond the series' reach; ``contact`` is a loss term."""
+    """Simulator of scenes partly strained beyond the range of the series; ``contact`` is a loss term."""
     terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0}, {"contact": contact})
     kinetic = Kinetic()
     kinetic.name, kinetic.weight = "kinetic", 3.0
@@ -58,13 +58,13 @@ def simulator_of(
 
 
 def actions_of(scenes: Sequence[int]) -> np.ndarray:
-    """Actions of which some are clipped, the same of a scene in any batch, shape [batch, STEPS, action]."""
+    """Actions, some of them clipped, identical for a scene in any batch, shape [batch, STEPS, action]."""
     size = STEPS, SCENES[0].action_dim
     return np.stack([np.random.default_rng(7 + k).uniform(-1.2, 1.2, size=size) for k in scenes])
 
 
 def computed(simulator: Simulator, scenes: Sequence[int] = ALL) -> Results:
-    """All that a rollout gives, by environment, copied out: the next simulator takes this one's memory."""
+    """Copies of all results of a rollout, by environment, because the next simulator reuses the memory."""
     rollout = simulator.rollout(actions_of(scenes))
     state, first = simulator.state(), simulator.state_gradient()
     out = {name: getattr(state, name) for name in ("x", "v", "C", "F", "poses")}
@@ -76,8 +76,8 @@ def computed(simulator: Simulator, scenes: Sequence[int] = ALL) -> Results:
 
 
 def results_of(scenes: Sequence[int], precision: str, contact: str, times: int = 1) -> list[Results]:
-    """Results of a deterministic simulator of some scenes, each time; the simulator is gone before there is
-    another, as only then its kernels are not compiled anew."""
+    """Results of deterministic simulators of some scenes, one simulator at a time, because kernels are
+    compiled again if another simulator exists."""
     simulator = simulator_of(scenes, precision, contact)
     results = [computed(simulator, scenes) for _ in range(times)]
     del simulator
@@ -86,12 +86,12 @@ def results_of(scenes: Sequence[int], precision: str, contact: str, times: int =
 
 
 def relative_error(got: np.ndarray, want: np.ndarray) -> float:
-    """Largest difference, relative to the largest value."""
+    """Largest difference relative to the largest value."""
     return float(np.abs(got - want).max() / np.abs(want).max())
 
 
 def assert_agreement(got: Results, want: Results, tolerance: float) -> None:
-    """Compare results to a tolerance, and print the errors (``pytest -s``)."""
+    """Compare results with a tolerance, and print the errors (``pytest -s``)."""
     errors = {name: relative_error(got[name], want[name]) for name in want}
     print(", ".join(f"{name} {error:.1e}" for name, error in errors.items()))
     assert max(errors.values()) < tolerance, errors
@@ -103,7 +103,7 @@ def assert_same_bits(got: Results, want: Results) -> None:
 
 
 def assert_cuda_agrees_with_the_cpu(contact: str) -> None:
-    """In both contact models, in steps without a history, and where states of the way back are recomputed."""
+    """Compare both contact models, steps without history, and recomputed states in the backward pass."""
     wants = []
     for device in ("cpu", "cuda"):
         simulator = simulator_of(ALL, "float64", contact, device=device, deterministic=False)

@@ -1,4 +1,4 @@
-"""Changes of files by this process, event by event: to count them, or to fail or die at one of them.
+"""Fault injection for file operations of this process: count events, or fail or die at one of them.
 
 Events are ``create``, ``write`` (each in two halves, as a full disk or a kill may cut one off), ``fsync``,
 ``replace``, ``unlink``, ``mkdir``, ``rmdir`` and ``reserve``. HDF5 files are made in memory, so that all of
@@ -23,18 +23,18 @@ from plab.results import read
 from plab.results.run_file import encode
 
 DEATH = -1
-"""Instead of an error: the run dies, and from then on no file can be changed."""
+"""In place of an error: the run dies, and no file can be changed afterwards."""
 
 
 class Death(BaseException):
-    """End of a run whose process goes on."""
+    """Simulated end of the process."""
 
 
 class Failing:
-    """Failure at one of the events, whose kinds ``seen`` collects.
+    """Failure at one event; the kinds of events are collected in ``seen``.
 
-    ``at`` is its number, -1 for none; ``error`` that of the disk, such as ``errno.ENOSPC``. If ``lasting``
-    later events fail, too, except that files can still be removed from a disk that is full.
+    ``at`` is the number of the event, -1 for none; ``error`` is an error number such as ``errno.ENOSPC``. If
+    ``lasting``, later events fail, too, except for removing files from a full disk.
     """
 
     def __init__(self, at: int, error: int, *, lasting: bool = False) -> None:
@@ -42,7 +42,7 @@ class Failing:
         self.seen: list[str] = []
 
     def __call__(self, kind: str, path: str) -> None:
-        """Take part in an event."""
+        """Process an event."""
         number = len(self.seen)
         self.seen.append(kind)
         removes = kind in ("unlink", "rmdir") and self._error == errno.ENOSPC
@@ -52,7 +52,7 @@ class Failing:
 
 
 class _Raw(io.FileIO):
-    """File that is written in two halves, each an event."""
+    """File written in two halves, each of which is an event."""
 
     def __init__(self, path: str, mode: str, event: Callable[[str, str], None]) -> None:
         event("create", path)
@@ -113,7 +113,7 @@ def watched(folder: Path, event: Callable[[str, str], None]) -> Iterator[None]:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return the contents of all files but the toy runner's log, by name, without times and provenance."""
+    """Return the contents of all files except the toy runner's log, by name, without times and provenance."""
 
     def content(path: Path) -> bytes:
         if path.suffix == ".npz":

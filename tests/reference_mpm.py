@@ -1,4 +1,4 @@
-"""A slow, plain reference of the physics: the oracle that the fast simulator is compared with.
+"""Slow, plain reference implementation of the physics, with which the simulator is compared.
 
 One environment, float64 torch on a dense grid, differentiable with torch autograd. It follows the paper's
 formulas literally (singular value decomposition, Hencky strain, one tensor operation per formula) and shares
@@ -50,7 +50,7 @@ class State:
 
 
 def initial_state(scene: Scene, x: Tensor | None = None) -> State:
-    """State at t = 0: at rest, undeformed; particles x [particle, 3] are sampled unless given."""
+    """State at t = 0, at rest and undeformed; particles x [particle, 3] are sampled unless given."""
     x = torch.as_tensor(sample_particles(scene) if x is None else x, dtype=torch.float64)
     rows = [(*m.position, *m.rotation, m.gap) for m in scene.manipulators]
     return State(
@@ -63,9 +63,9 @@ def initial_state(scene: Scene, x: Tensor | None = None) -> State:
 
 
 def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
-    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A].
+    """Advance by one environment step: ``scene.substeps`` substeps with the same action, shape [A].
 
-    With the scene's ``numbers="release"``, rotations that are not of unit length are so from now on.
+    With ``numbers="release"`` in the scene, rotations that are not of unit length are normalised here.
     """
     if scene.digits_convention == "release":
         state = replace(state, poses=_unit_rotations(state.poses))
@@ -81,7 +81,7 @@ def _unit_rotations(poses: Tensor) -> Tensor:
 
 
 def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
-    """Advance by one substep of an environment step's action [A]; alpha is soft contact's stiffness, or 0."""
+    """Advance by one substep with an action [A]; alpha is the decay rate of soft contact, or 0."""
     F_trial = (_identity() + scene.dt * state.C) @ state.F
     F, tau = material_update(scene, F_trial, state.C)
     momentum, mass = _particles_to_grid(scene, state, tau)
@@ -96,7 +96,7 @@ def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
 
 
 def proper_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations U and V and values S with F = U diag(S) V^T; the smallest is negative where det F < 0."""
+    """Rotations U and V and values S with F = U diag(S) V^T; the smallest value is negative if det F < 0."""
     U, S, Vt = torch.linalg.svd(F)
     keep = torch.ones_like(S[..., :2])
     flip_U = torch.cat([keep, torch.linalg.det(U.detach()).sign()[..., None]], dim=-1)
@@ -128,7 +128,7 @@ def kirchhoff_stress(scene: Scene, F: Tensor, R: Tensor) -> Tensor:
 
 
 def material_update(scene: Scene, F_trial: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
-    """F after the substep and Kirchhoff stress, each body's under its law, both [particle, 3, 3]."""
+    """F after the substep and Kirchhoff stress, under the law of each body, both [particle, 3, 3]."""
     if set(scene.laws) == {"von_mises"}:
         F, R = return_mapping(scene, F_trial)
         return F, kirchhoff_stress(scene, F, R)
@@ -166,7 +166,7 @@ def _fluid(_dt: float, G: Tensor, C: Tensor, bulk_modulus: float, viscosity: flo
 
 
 def _hencky(G: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """U, V^T, trace and deviator of the Hencky strains, and the deviator's norm."""
+    """U, V^T, trace and deviator of the Hencky strains, and the norm of the deviator."""
     U, S, Vt = proper_svd(G)
     e = S.clamp(min=MIN_SINGULAR_VALUE).log()
     trace = e.sum(dim=-1, keepdim=True)
@@ -177,7 +177,7 @@ def _hencky(G: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 def _returned(
     G: Tensor, U: Tensor, k: Tensor, d: Tensor, mu: float, pressure: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """F and stress of Hencky elasticity after the deviator is scaled by k."""
+    """F and stress of Hencky elasticity after scaling the deviator by k."""
     tau = (U * (2.0 * mu * k * d + pressure)[..., None, :]) @ U.mT
     return (U * ((k - 1.0) * d).exp()[..., None, :]) @ U.mT @ G, tau
 
@@ -185,7 +185,7 @@ def _returned(
 def _drucker_prager(
     _dt: float, G: Tensor, _C: Tensor, friction_angle: float, **elasticity: float
 ) -> tuple[Tensor, Tensor]:
-    """Deviator of at most alpha times the pressure; nothing in tension."""
+    """Deviator limited to alpha times the pressure; no stress in tension."""
     mu, lam = _lame(**elasticity)
     U, _Vt, trace, d, norm = _hencky(G)
     sine = math.sin(math.radians(friction_angle))
@@ -222,7 +222,7 @@ LAWS = {
 
 
 def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:
-    """One value per body as one per particle, shape [particle, 1]; any count is of a scene's only body."""
+    """Values per body, repeated for their particles, shape [particle, 1]."""
     table = torch.tensor(values, dtype=torch.float64)
     if len(table) == 1:
         return table.expand(count)[:, None]
@@ -246,7 +246,7 @@ def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _flat(scene: Scene, node: Tensor) -> Tensor:
-    """Position of the nodes [..., 3], whose indices start at -1, in a flat grid array."""
+    """Index of nodes [..., 3], numbered from -1, in a flat grid array."""
     i, j, k = (node + 1).unbind(dim=-1)
     side = scene.grid_size + 1
     return (i * side + j) * side + k
@@ -259,7 +259,7 @@ def _nodes(scene: Scene) -> Tensor:
 
 
 def _particles_to_grid(scene: Scene, state: State, tau: Tensor) -> tuple[Tensor, Tensor]:
-    """P2G: momentum [(n + 1)^3, 3] and mass [(n + 1)^3] of the nodes."""
+    """P2G transfer: momentum [(n + 1)^3, 3] and mass [(n + 1)^3] of the nodes."""
     m = scene.particle_mass
     node, weight, offset = _stencil(scene, state.x)
     affine = -scene.dt * scene.particle_volume * 4.0 / scene.dx**2 * tau + m * state.C
@@ -272,14 +272,14 @@ def _particles_to_grid(scene: Scene, state: State, tau: Tensor) -> tuple[Tensor,
 
 
 def _grid_to_particles(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """G2P: the particles' v [particle, 3] and C [particle, 3, 3] from the nodes' velocity [(n + 1)^3, 3]."""
+    """G2P transfer: v [particle, 3] and C [particle, 3, 3] from the nodes' velocity [(n + 1)^3, 3]."""
     node, weight, offset = _stencil(scene, x)
     wv = weight[..., None] * velocity[_flat(scene, node)]
     return wv.sum(dim=1), 4.0 / scene.dx**2 * (wv[..., :, None] * offset[..., None, :]).sum(dim=1)
 
 
 def mass_tensor(scene: Scene, x: Tensor) -> Tensor:
-    """Mass of the grid nodes, shape [n, n, n]; the ghost nodes' mass goes to their neighbour, node 0."""
+    """Mass of the grid nodes, shape [n, n, n]; the mass of ghost nodes is added to node 0."""
     n = scene.grid_size
     node, weight, _ = _stencil(scene, x)
     i, j, k = node.clamp(min=0).unbind(dim=-1)
@@ -310,8 +310,8 @@ def _grid_update(
 def contact(v: Tensor, u: Tensor, d: Tensor, normal: Tensor, friction: float, alpha: float) -> Tensor:
     """Velocity of the nodes [node, 3] after contact with one manipulator.
 
-    It has the rigid velocity u [node, 3], signed distances d [node] and outward normals [node, 3]; v is the
-    velocity before, alpha the stiffness of soft contact, or 0 for the hard model.
+    u [node, 3] is the manipulator's rigid velocity, d [node] the signed distance, and normals are [node, 3];
+    v is the velocity before contact, alpha the decay rate of soft contact, or 0 for the hard model.
     """
     s = torch.exp(-alpha * d.clamp(min=0.0))[:, None]  # min(exp(-alpha d), 1) that cannot overflow
     touches = d <= 0
@@ -327,7 +327,7 @@ def contact(v: Tensor, u: Tensor, d: Tensor, normal: Tensor, friction: float, al
 
 
 def walls(scene: Scene, node: Tensor, v: Tensor) -> Tensor:
-    """Velocity of the nodes [node, 3] after the walls and the floor, axis x, then y, then z."""
+    """Velocity of the nodes [node, 3] after walls and floor, for axis x, then y, then z."""
     for axis in range(3):
         outward = torch.zeros(3, dtype=torch.bool)
         outward[axis] = True
@@ -340,7 +340,7 @@ def walls(scene: Scene, node: Tensor, v: Tensor) -> Tensor:
 
 
 def floor_contact(v: Tensor, friction: float) -> Tensor:
-    """Velocity of nodes [node, 3] that meet the floor with v_y < 0."""
+    """Velocity of nodes [node, 3] that hit the floor with v_y < 0."""
     tangential = v * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
     if friction == 0:
         return tangential
@@ -355,7 +355,7 @@ def floor_contact(v: Tensor, friction: float) -> Tensor:
 
 
 def move_manipulators(scene: Scene, poses: Tensor, action: Tensor) -> Tensor:
-    """Poses [manipulator, 8] at the end of a substep of an environment step's action [A]."""
+    """Poses [manipulator, 8] after a substep with an environment step's action [A]."""
     actions = action.to(torch.float64).clamp(-1.0, 1.0).split([m.action_dim for m in scene.manipulators])
     ends = []
     for manipulator, pose, part in zip(scene.manipulators, poses, actions, strict=True):
@@ -425,8 +425,8 @@ def rotation_quaternion(rotvec: Tensor) -> Tensor:
 def rotate(q: Tensor, points: Tensor) -> Tensor:
     """Rotate points [..., 3] by the quaternion q [4].
 
-    Only the direction of q counts: a quaternion that is not quite of unit length would otherwise scale the
-    points, and the rigid velocity divides that error by the time step.
+    q is normalised, because a quaternion of slightly different length would scale the points, and the rigid
+    velocity divides this error by the time step.
     """
     w, xyz = q[0], q[1:].expand_as(points)
     cross = torch.linalg.cross(xyz, points)
@@ -458,15 +458,14 @@ def _conjugate(q: Tensor) -> Tensor:
 def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Signed distance [...] of points [..., 3] to a manipulator, and its gradient, the outward normal.
 
-    Where symmetry leaves a direction of the normal undefined (on the axis of a capsule, say) that part of it
-    is 0.
+    Components of the normal that symmetry leaves undefined, for example on the axis of a capsule, are 0.
     """
     d, normal = _DISTANCES[manipulator.shape](manipulator.size, pose[7], to_frame(pose, points))
     return d, rotate(pose[3:7], normal)
 
 
 def _sphere(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance and normal, own frame, of a sphere."""
+    """Distance and normal of a sphere in its frame."""
     return _norm(p) - size[0], _direction(p)
 
 
@@ -483,7 +482,7 @@ def _capsule(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, T
 
 
 def _chopsticks(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearer of two sticks; the one at +gap/2 where both are equally far."""
+    """Distance to the nearer of two sticks, by default the stick at +gap/2."""
     h, r = size
     shift = torch.stack([gap / 2.0, torch.zeros_like(gap), torch.zeros_like(gap)])
     d_a, normal_a = _segment(p - shift, -h, 0.0, r)
@@ -493,7 +492,7 @@ def _chopsticks(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor
 
 
 def _torus(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Ring of radius tx about the y axis, thick by radius ty."""
+    """Ring about the y axis with major radius tx and minor radius ty."""
     tx, ty = size
     radial = _radial(p)
     q = torch.stack([_norm(radial) - tx, p[..., 1]], dim=-1)
@@ -516,8 +515,8 @@ def _box(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tenso
 
 
 def _corner(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance [...] to the corner {q <= 0} of faces and its gradient [..., face]; inside, to the
-    nearest face (the first of equally near ones)."""
+    """Signed distance [...] to the corner {q <= 0} of faces, and its gradient [..., face]; inside, to the
+    nearest face (the first in case of ties)."""
     positive = q.clamp(min=0.0)
     outside = (q > 0).any(dim=-1)
     nearest = torch.nn.functional.one_hot(q.argmax(dim=-1), q.shape[-1]).to(q.dtype)
@@ -542,7 +541,7 @@ def _radial(p: Tensor) -> Tensor:
 
 
 def _norm(a: Tensor) -> Tensor:
-    """Length of the vectors a [..., axis]; derivative 0 at 0."""
+    """Length of vectors a [..., axis], with derivative 0 at 0."""
     square = (a * a).sum(dim=-1)
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
 
@@ -563,10 +562,10 @@ def _identity() -> Tensor:
 def loss_terms(
     scene: Scene, state: State, target_mass: Tensor, target_sdf: Tensor, contact: str = "nearest"
 ) -> Tensor:
-    """The unweighted terms of one step's loss: density, sdf, contact.
+    """Unweighted loss terms of one step: density, sdf and contact.
 
-    ``contact`` is the gradient of the contact term: its own (``nearest``), or that of an atomic minimum which
-    is differentiated as if it were a sum (``all``).
+    ``contact`` selects the gradient of the contact term: exact (``nearest``), or that of an atomic minimum
+    differentiated like a sum (``all``).
     """
     mass = mass_tensor(scene, state.x)
     contact_term = torch.zeros((), dtype=torch.float64)
@@ -591,9 +590,9 @@ def rollout_loss(
     weights: tuple[float, float, float] = (10, 10, 1),
     contact: str = "nearest",
 ) -> tuple[Tensor, State]:
-    """Sum of the step losses over a rollout of actions [T, A], and the state at its end.
+    """Sum of the step losses over a rollout of actions [T, A], and the final state.
 
-    ``weights`` are those of density, sdf and contact, ``contact`` as in :func:`loss_terms`.
+    ``weights`` are for density, sdf and contact; ``contact`` is as in :func:`loss_terms`.
     """
     loss = torch.zeros((), dtype=torch.float64)
     weight = torch.tensor(weights, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Form of a refusal: exit code 2, one line on standard error, nothing on standard output."""
+"""Checks of refusals: exit code 2, one line on standard error, nothing on standard output."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["ending", "refusal", "snapshot"]
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    """Folders and files below a folder, with the content of files; None of what cannot be read."""
+    """Folders and files below a folder with the content of each file, None if unreadable."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         if path.is_file() and os.access(path, os.R_OK)
@@ -22,7 +22,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 
 def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
-    """Assert that a command line has refused its arguments; return the line."""
+    """Assert that a command line has been refused; return the message."""
     assert code == 2, f"exit code {code}: {argv}"
     assert out == ""
     assert "Traceback" not in err

@@ -1,4 +1,4 @@
-"""Comparison of runs, and interruptions, for tests of resuming and batching."""
+"""Comparison and interruption of runs, for tests of resuming and batching."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from plab.results.running import RunFile
 from plab.runners.runner import SimulatorCache
 
 TIMES = ["seconds"]
-"""Columns in which two runs of the same numbers differ."""
+"""Columns in which two identical runs differ."""
 
 
 def assert_same_numbers(got: RunResult, want: RunResult) -> None:
-    """Assert that two runs agree bit for bit in everything but times and provenance."""
+    """Assert that two runs are bitwise identical except for times and provenance."""
     assert got.status == want.status
     rows = [result.iterations.drop(columns=TIMES) for result in (got, want)]
     pd.testing.assert_frame_equal(*rows, check_exact=True)
@@ -34,7 +34,7 @@ def assert_same_numbers(got: RunResult, want: RunResult) -> None:
 
 
 def finished_as(cfg: Config, want: RunResult) -> RunResult:
-    """Assert that a configuration's file is finished and the same as another run of it; return it."""
+    """Assert that a configuration's file is finished and equals that of another run; return it."""
     got = read(cfg.path)
     assert got.status == "finished" and got.config_hash == want.config_hash
     assert_same_numbers(got, want)
@@ -43,7 +43,7 @@ def finished_as(cfg: Config, want: RunResult) -> RunResult:
 
 @contextmanager
 def raising(error: BaseException, call: int, where: Any, name: str) -> Iterator[None]:
-    """Raise an error in the block at a call of a function, counted from 0."""
+    """Raise an error inside the block at a given call of a function, counted from 0."""
     intact: Callable = getattr(where, name)
     calls = count()
 
@@ -59,13 +59,13 @@ def raising(error: BaseException, call: int, where: Any, name: str) -> Iterator[
 
 @contextmanager
 def stopped_at(call: int, where: Any = RunFile, name: str = "record") -> Iterator[None]:
-    """Interrupt the block at a call of a function, counted from 0, and catch that outside."""
+    """Interrupt the block at a given call of a function, counted from 0."""
     with pytest.raises(KeyboardInterrupt), raising(KeyboardInterrupt(), call, where, name):
         yield
 
 
 class KeepsAll(SimulatorCache):
-    """Cache of all simulators of a module, as building one takes longer than a run."""
+    """Cache of all simulators of a module, because building one takes longer than a run."""
 
     def get(self, key: Any, build: Callable[[], Any], *, check: Callable[[Any], object]) -> Any:
         if key in self._kept:

@@ -1,5 +1,5 @@
-"""Small scenes, and a term of the loss: one body and all seven manipulators, one of them near it, in every
-environment.
+"""Small scenes with one body and all seven manipulators, one of which touches it in each environment, and a
+loss term.
 
 All environments of a batch share one compiled simulator, so that one compilation serves every manipulator.
 """
@@ -66,7 +66,7 @@ ROTATIONS = {
 
 
 def manipulator(kind: str, near: bool) -> Manipulator:
-    """One manipulator touching the body, or out of its way."""
+    """Manipulator that touches the body, or is far away."""
     return Manipulator(
         kind,
         SIZES[kind],
@@ -79,12 +79,12 @@ def manipulator(kind: str, near: bool) -> Manipulator:
 
 
 def scene(near: tuple[str, ...], *, particles: int = 150, floor: bool = False, **changes: float) -> Scene:
-    """A box of plasticine with the manipulators named in ``near`` touching it.
+    """Plasticine box, touched by the manipulators named in ``near``.
 
     Args:
         near: Shapes of the manipulators that touch the body; the others are far away.
         particles: Number of particles.
-        floor: Put the body onto the floor instead of into the air.
+        floor: Whether the body is on the floor instead of in the air.
         **changes: Fields of the scene.
     """
     center = (0.5, 0.5 * WIDTH, 0.5) if floor else tuple(CENTER)
@@ -94,12 +94,12 @@ def scene(near: tuple[str, ...], *, particles: int = 150, floor: bool = False, *
 
 
 def tools(made: Scene, kinds: Sequence[str]) -> tuple[Manipulator, ...]:
-    """The manipulators of some shapes among a scene's."""
+    """Manipulators of some shapes in a scene."""
     return tuple(m for m in made.manipulators if m.shape in kinds)
 
 
 def batch() -> list[Scene]:
-    """One environment per manipulator, one with all of them, one on a rough floor, one stiff and one soft."""
+    """Scenes: one per manipulator, one with all of them, one with a rough floor, one stiff, one soft."""
     scenes = [scene((kind,)) for kind in KINDS]
     scenes.append(scene(KINDS))
     scenes.append(scene((), floor=True, floor_friction=0.4))
@@ -109,21 +109,21 @@ def batch() -> list[Scene]:
 
 
 class Kinetic(ParticleTerm):
-    """Kinetic energy, and how high it is: a term of particles."""
+    """Particle term: sum of squared speed times height."""
 
     @ti.func
     def measure(self, e, x, v):
-        """Square of the velocity, times the height."""
+        """Squared speed times height."""
         return 0.5 * v.dot(v) * x[1]
 
     @ti.func
     def gradient(self, e, x, v):
-        """By position and velocity."""
+        """Derivatives with respect to position and velocity."""
         return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
 
 
 def reference_state(state: State, e: int) -> reference.State:
-    """State of one environment, for the plain reference."""
+    """State of one environment for the reference implementation."""
     import torch
 
     import reference_mpm
@@ -133,7 +133,7 @@ def reference_state(state: State, e: int) -> reference.State:
 
 
 def assert_same_state(got: State, e: int, want: reference.State) -> None:
-    """Compare an environment's state with the plain reference's, to 1e-9 of the largest number, or of 1."""
+    """Compare an environment's state with the reference, to 1e-9 of the largest number or of 1."""
     for name in ("x", "v", "C", "F", "poses"):
         a, b = getattr(got, name)[e], getattr(want, name).numpy()
         error = np.abs(a - b).max() / max(1.0, np.abs(b).max())
@@ -141,7 +141,7 @@ def assert_same_state(got: State, e: int, want: reference.State) -> None:
 
 
 def make_not_finite(simulator: Simulator, env: int) -> None:
-    """Give a particle of an environment a velocity that is not a number."""
+    """Set the velocity of a particle of an environment to NaN."""
     state = simulator.state()
     state.v[env, 5] = np.nan
     simulator.set_state(state)

@@ -1,4 +1,4 @@
-"""Result files with made-up numbers, written by the real writer."""
+"""Result files with synthetic numbers, written by the real writer."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def run(folder: Path, **which: Any) -> RunResult:
 
 
 def cut(result: RunResult, rows: int) -> RunResult:
-    """Return a result with no more than the first of its iterations."""
+    """Return a result with only the first iterations."""
     return replace(result, columns={name: values[:rows] for name, values in result.columns.items()})
 
 
 def save(result: RunResult) -> Path:
-    """Write a result to its place and return that."""
+    """Write a result to its path, and return the path."""
     config = result.config
     path = Path(config["results_dir"]) / member_name(config, config_hash(config))
     if result.status != "finished":

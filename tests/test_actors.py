@@ -1,4 +1,4 @@
-"""Policies trained through the simulator's gradient: runs of shac and pods on a coarse scene, and parts."""
+"""Policies trained through the simulator's gradient: runs of shac and pods, and their parts."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def make_config(folder: Path | str, name: str = "shac", *overrides: str) -> Conf
 
 
 def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
-    """Environments of a training and of the evaluation, all of them of the same scene."""
+    """Training and evaluation environments, all with the same scene."""
     training, judge = shared_batches(CACHE, ([cfg] * ENVS, cfg.method.contact), ([cfg], "hard"))
     return training, judge
 
@@ -72,7 +72,7 @@ def run(cfg: Config) -> RunResult:
 
 @pytest.fixture(scope="module", params=METHODS)
 def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """An uninterrupted run."""
+    """Uninterrupted run."""
     return run(make_config(tmp_path_factory.mktemp("results"), request.param))
 
 
@@ -150,7 +150,7 @@ def test_targets_look_ahead_as_far_as_lambda_says() -> None:
     gamma, decay = 0.9, 0.7
 
     def ahead(t: int, count: int) -> torch.Tensor:
-        """Rewards of so many steps, then the value."""
+        """Sum of some rewards and the value after them."""
         return sum(gamma**k * rewards[t + k] for k in range(count)) + gamma**count * values[t + count]
 
     for t in range(4):
@@ -207,7 +207,7 @@ def test_rounds_take_the_drawn_scenes_in_turn() -> None:
 
 @pytest.fixture
 def training() -> PodsRunner:
-    """One of pods, in three environments."""
+    """Training of pods with three environments."""
     cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01", "method.scenes=0")
     return prepared(cfg)
 

@@ -1,4 +1,4 @@
-"""Trajectory losses in torch's autograd, and the policy network that is trained by them: a coarse scene."""
+"""Trajectory losses in torch's autograd, and training of a policy network with them, on a coarse scene."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COARSE = [
 
 @pytest.fixture(scope="module")
 def episodes() -> EpisodeBatch:
-    """Two environments of which the second has a softer rope; they see their targets."""
+    """Two environments, the second with a softer rope; the target is observed."""
     first = load_config([*COARSE, "sim=reference", "observe_target=true"])
     second = load_config([*COARSE, "sim=reference", "observe_target=true", "task.yield_stress=20"])
     return EpisodeBatch([first, second], contact="soft")
@@ -117,7 +117,7 @@ def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem)
 
 
 def network(episodes: EpisodeBatch, outputs: int, seed: int = 0) -> torch.nn.Sequential:
-    """A network that reacts to what it sees, in float64."""
+    """Float64 network that depends on the observation."""
     entries = episodes.observation_space.shape[0]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

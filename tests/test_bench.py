@@ -1,4 +1,4 @@
-"""Benchmarks: complete rows of the speed benchmark, cases that survive, policies in unseen scenes."""
+"""Benchmarks: complete rows of the speed benchmark, surviving cases, policies in unseen scenes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_speed_prints_and_writes_complete_rows(
 
 
 def still(observation: np.ndarray) -> np.ndarray:
-    """A policy of Move that does nothing."""
+    """Policy for Move that does nothing."""
     return np.zeros((len(observation), 6))
 
 

@@ -1,4 +1,4 @@
-"""Pictures of all environments: depth and labels against closed forms, alone and in a batch."""
+"""Camera images of all environments: depth and labels against closed forms, alone and in a batch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 
 
 def scene(center: tuple[float, float, float], particles: int = 4000) -> Scene:
-    """A ball of plasticine and a sphere beside it."""
+    """A plasticine ball and a sphere next to it."""
     return Scene(
         "Camera",
         (Body("sphere", center, (0.12,), particles),),
@@ -34,7 +34,7 @@ def scene(center: tuple[float, float, float], particles: int = 4000) -> Scene:
 
 
 def ball_depth(camera: Camera, center: tuple[float, float, float], radius: float) -> np.ndarray:
-    """Depth of a ball in each pixel, NaN beside it."""
+    """Depth of a ball at each pixel, NaN outside."""
     rays = camera.points(np.ones(SIZE[::-1])) - np.array(camera.position)
     offset = np.array(center) - camera.position
     along, square = rays @ offset, (rays**2).sum(axis=-1)

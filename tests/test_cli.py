@@ -1,4 +1,4 @@
-"""Command line of runs: help, sweeps, experiments, exit codes, Ctrl-C, traces on disk."""
+"""Command line of runs: help, sweeps, experiments, exit codes, Ctrl-C, written files."""
 
 from __future__ import annotations
 

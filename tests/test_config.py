@@ -1,4 +1,4 @@
-"""Configuration: YAML against dataclasses, choices by task and protocol, ranges, and the resulting scenes."""
+"""Configuration: YAML against dataclasses, values by task and protocol, ranges, and the resulting scenes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VARIANTS = [
     for number, task in enumerate(SUITE)
     for variant in range(1, 6)
 ]
-"""Each task once, the others nightly."""
+"""Each task once; all variants nightly."""
 
 
 # ------------------------------------------------------------------------------ YAML and dataclasses
@@ -242,7 +242,7 @@ and ``left`` of the task, or nothing for the root."""
 
 @functools.cache
 def section(name: str) -> tuple[Any, tuple[str, ...]]:
-    """A section of the configuration, and the arguments of its ``check``."""
+    """Section of the configuration, and the arguments of its ``check``."""
     cfg = load_config([f"method={name}"] if name in choices("method") else [])
     parts = {"": (cfg, ()), "body": (cfg.task.bodies["rope"], ("task.bodies.rope",))}
     parts["left"] = cfg.task.manipulators["left"], ("task.manipulators.left",)

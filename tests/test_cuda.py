@@ -1,7 +1,6 @@
-"""CUDA against the CPU, which tests/test_simulator.py holds against the plain reference; steps of one launch.
+"""CUDA against the CPU, which tests/test_simulator.py compares with the reference; single-launch steps.
 
-In float64 both devices' kernels compute the same numbers but for the order of sums, so that what is left
-over is rounding.
+In float64 the kernels of both devices differ only in the order of sums, so the remaining errors are rounding.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""CUDA against the CPU where a step is many launches; spread of the gradient in float32."""
+"""CUDA against the CPU for steps with many launches; variation of the gradient in float32."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.gpu]
 
 
 def test_steps_of_many_launches_agree_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So are those of many particles, which are put into order before. These scenes have few."""
+    """Scenes with many particles, which are sorted first, also take many launches; these scenes have few."""
     monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 0)
     assert_cuda_agrees_with_the_cpu("nearest")
 

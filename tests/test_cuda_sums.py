@@ -1,4 +1,4 @@
-"""Sums of integers as CUDA adds them up, in any order and with all digits: Taichi's additions on the CPU."""
+"""Deterministic CUDA sums in any order and with all digits, with Taichi's additions on the CPU."""
 
 import math
 
@@ -74,7 +74,7 @@ def cleared(adder: Adder) -> None:
 
 
 def total(adder: Adder, values: np.ndarray) -> float:
-    """The sum of some float64, as the device adds it up."""
+    """Sum of some float64 as the device computes it."""
     adder.add_all(1, values)
     adder.take()
     first, second = adder.taken.to_numpy()
@@ -97,7 +97,7 @@ def test_a_sum_of_integers_is_exact_and_has_the_same_bits_in_any_order(adder: Ad
 
 
 def added(adder: Adder, adjoint: bool, values: np.ndarray, bounded: np.ndarray | None = None) -> np.ndarray:
-    """Sum of a node's 4-vectors; of adjoints in the units that a bound of some numbers gives."""
+    """Sum of a node's 4-vectors; for adjoints, in the units derived from a bound."""
     adder.clear()
     if bounded is not None:
         adder.bound(bounded)
@@ -119,7 +119,7 @@ def test_momentum_is_added_in_any_order_to_the_digits_of_float32(adder: Adder) -
 
 
 def test_adjoints_of_any_size_are_added_to_the_digits_of_float32(adder: Adder) -> None:
-    """One that is broken breaks all of its environment."""
+    """A non-finite adjoint makes the whole environment non-finite."""
     for size in (1e-20, 1e-3, 1.0, 1e12, 1e30):
         values = (size * np.random.default_rng(2).normal(size=(1000, 4))).astype(np.float32)
         wide = values.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Datasets of demonstrations and policies cloned from them: what is written, read, learned and refused."""
+"""Datasets of demonstrations and policies cloned from them: writing, reading, learning and refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CACHE = KeepsAll()
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a dataset of drawn scenes, solved by two updates, with pictures."""
+    """Folder with a dataset of random scenes, solved by two updates, with images."""
     folder = tmp_path_factory.mktemp("datasets")
     (folder / "cameras.yaml").write_text(
         "top: {position: [0.5, 2, 0.5], target: [0.5, 0, 0.5], size: [8, 4]}"

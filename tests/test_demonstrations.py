@@ -1,4 +1,4 @@
-"""Recorded demonstrations: complete, those of scripts up to date, reaching what is recorded."""
+"""Recorded demonstrations: complete, up to date with scripts, and reproducing their scores."""
 
 from __future__ import annotations
 

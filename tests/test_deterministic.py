@@ -1,4 +1,4 @@
-"""A deterministic simulator on CUDA: the same bits in every run and in any batch, forward and gradient."""
+"""Deterministic simulator on CUDA: bitwise identical in every run and batch, forward and gradient."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_every_run_and_every_batch_has_the_same_bits(contact: str) -> None:
 
 
 def test_a_broken_state_is_still_found() -> None:
-    """By what would not fit into a node's integers: a velocity, and stress without a limit."""
+    """Detect values that exceed a node's integers: a velocity, and unlimited stress."""
     fast, strained = 1, 10
     simulator = simulator_of([0, fast, strained], "float32", "nearest")
     start = simulator.state()

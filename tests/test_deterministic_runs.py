@@ -1,4 +1,4 @@
-"""Deterministic on CUDA: float64 in fixed point, a long rollout, and a whole run."""
+"""Deterministic CUDA: float64 in fixed point, a long rollout, and a complete run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.gpu]
 
 
 def test_float64_has_the_same_bits_and_computes_what_the_cpu_does() -> None:
-    """In fixed point, whose units are far below float32's digits, and above float64's."""
+    """Fixed-point units are far below the digits of float32, and above those of float64."""
     got, again = results_of(ALL, "float64", "all", times=2)
     assert_same_bits(again, got)
     assert_agreement(got, computed(simulator_of(ALL, "float64", "all", device="cpu")), 1e-6)

@@ -1,4 +1,4 @@
-"""Full and read-only disks, killed processes, damaged files, locks: results are complete or absent."""
+"""Full and read-only disks, killed processes, damaged files and locks: results are complete or absent."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _toy_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )
 def test_a_batch_is_completed_after_a_failure_at_any_event(monkeypatch, error: int, lasting: bool) -> None:
-    """Failure at each change of a file, one after the other, then the same batch undisturbed."""
+    """Fail at each file operation in turn, then run the same batch undisturbed."""
     monkeypatch.setattr(toy_runner, "ITERATIONS", 2)
     cfgs = configs("checkpoint_seconds=0", seeds=(0,) if error == DEATH else (0, 1))
     count = Failing(-1, error)
@@ -81,7 +81,7 @@ def test_a_batch_is_completed_after_a_failure_at_any_event(monkeypatch, error: i
 
 @pytest.mark.skipif(sys.platform != "linux", reason="follows descriptors in /proc")
 def test_a_finished_sweep_on_a_disk_that_is_read_only_ends_well(capsys) -> None:
-    """Also with leftovers of a process that was killed just after it had finished a run."""
+    """Include leftovers of a process that was killed just after finishing a run."""
     assert main(list(SWEEP)) == 0
     cfgs = configs()
     lock_path(cfgs[0].path).touch()
@@ -149,7 +149,7 @@ def test_files_of_a_refused_run_are_removed_unless_an_earlier_process_left_them(
 
 
 def test_a_repetition_begins_without_the_state_that_it_replaces() -> None:
-    """A repetition that is killed must not go on from that state, as its replay buffer is another one."""
+    """A killed repetition must not resume from that state, because its replay buffer differs."""
     cfg = configs(seeds=(0,))[0]
     run = RunFile(cfg)
     run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(cfg)})

@@ -30,11 +30,11 @@ WORDS = {
     "status": ("task", "variant", "method", "seed"),
     "results": ("task", "variant", "method", "seed", "status"),
 }
-"""Names by which commands choose runs that exist, instead of composing a configuration."""
+"""Names by which commands select existing runs instead of composing a configuration."""
 
 
 def shown(page: Path) -> Iterator[str]:
-    """Yield what a page has in blocks of commands, and as code within the text."""
+    """Yield the content of a page's command blocks, and its inline code."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     blocks = re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     spans = re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
@@ -43,7 +43,7 @@ def shown(page: Path) -> Iterator[str]:
 
 
 def commands(pattern: str) -> list[str]:
-    """Return what the pages show that the pattern matches, without comments, once each."""
+    """Return the distinct page content that matches a pattern, without comments."""
     found = (re.search(pattern, line) for page in PAGES for line in shown(page))
     return sorted({match[0].partition(" #")[0].rstrip(" &") for match in found if match})
 
@@ -62,12 +62,12 @@ def compose(words: tuple[str, ...], config_dir: str | None = None) -> None:
 
 
 class Parsed(Exception):
-    """Ends a command line once its options have been read."""
+    """Exception that ends a command line once its options have been parsed."""
 
 
 @pytest.fixture(scope="module")
 def star_files(tmp_path_factory):
-    """A folder with what the script of docs/own_shapes.md writes into the working directory."""
+    """Folder with the files that the script of docs/own_shapes.md writes."""
     folder = tmp_path_factory.mktemp("star")
     code = (ROOT / "examples" / "own_shapes" / "star.py").read_text(encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
@@ -101,7 +101,7 @@ def test_a_command_that_is_shown_makes_sense(command, monkeypatch, star_files):
 
 
 def parsed(name: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
-    """Return the options of a command, of which nothing else is done."""
+    """Return the parsed options of a command without executing it."""
     options: list[argparse.Namespace] = []
     for way in ("parse_args", "parse_intermixed_args"):
         usual = getattr(argparse.ArgumentParser, way)
@@ -121,7 +121,7 @@ def parsed(name: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argpa
 
 
 def check_run(argv: list[str]) -> None:
-    """Compose what a run's command line asks for; of a sweep the first and the last run."""
+    """Compose the configuration of a run's command line, or of the first and last run of a sweep."""
     options = parser().parse_intermixed_args(argv)
     overrides = parse(prepared(options.overrides))
     assert options.multirun or not any(one.is_sweep_override() for one in overrides)
@@ -144,7 +144,7 @@ def test_what_is_made_has_a_rule(command):
 
 
 def cells(path: Path) -> list[str]:
-    """Code of a page's blocks, or of a notebook's cells."""
+    """Code of a page's blocks or of a notebook's cells."""
     text = path.read_text(encoding="utf-8")
     if path in PAGES:
         return re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Draws at every reset: the same alone and in a batch, by seed, by option, in training."""
+"""Randomisation at resets: identical alone and in a batch, by seed, by option, and in training."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_seeds_and_options(vector) -> None:
 
 
 def test_what_is_drawn_is_what_is_simulated(vector) -> None:
-    """A drawn episode is that of a task that has the numbers itself, to the last bit on the CPU."""
+    """A randomised episode is bitwise identical on the CPU to one of a task with the same numbers."""
     options = {"yield_stress": 30.0, "gravity": [0.0, -28.0, 0.0], "observation_noise": 0.0}
     options |= {"bodies.ball.offset": [0.01, 0.0, 0.0], "bodies.ball.yaw": 0.0, "floor_friction": 0.5}
     options |= {"manipulators.left.offset": [-0.01, 0.0, 0.0], "manipulators.left.friction": 0.3}
@@ -181,7 +181,7 @@ def test_refusals() -> None:
 
 @pytest.mark.parametrize("method", ["ppo", pytest.param("pods", marks=pytest.mark.nightly)])
 def test_methods_train_in_drawn_episodes(method: str, tmp_path: Path) -> None:
-    """Another range leads to other training and to an evaluation in the same scene."""
+    """A different range leads to a different training, and to an evaluation in the same scene."""
     words = [f"method={method}", "task=Move", *COARSE, f"results_dir={tmp_path}", "progress=false"]
     words += ["method.episodes=4", "method.num_envs=2", "method.evaluate_every=2", "method.hidden=[8]"]
     if method == "ppo":

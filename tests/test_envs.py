@@ -1,4 +1,4 @@
-"""The environments for Gymnasium and Stable-Baselines3, on a coarse scene."""
+"""Environments for Gymnasium and Stable-Baselines3 on a coarse scene."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ OVERRIDES = [*COARSE, *NEAR]
 
 @pytest.fixture(scope="module")
 def singles() -> Iterator[list[gymnasium.Env]]:
-    """Environments of two variants, as ``gymnasium.make`` makes them."""
+    """Environments of two variants, created by ``gymnasium.make``."""
     with warnings.catch_warnings():
         # Gymnasium calls versions but the highest out of date.
         warnings.filterwarnings("error", message=".*WARN")
@@ -68,7 +68,7 @@ def vector() -> Iterator[PlabVectorEnv]:
 
 @pytest.fixture
 def env(singles: list[gymnasium.Env]) -> PlabEnv:
-    """The environment of variant 1, without wrappers, in its initial state."""
+    """Environment of variant 1, without wrappers, in its initial state."""
     env = singles[0].unwrapped
     env.reset(seed=0)
     return env
@@ -289,7 +289,7 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
 
 @pytest.mark.parametrize("at", [0, 1])
 def test_what_breaks_off_rests_until_the_next_episode(vector: PlabVectorEnv, at: int) -> None:
-    """The first environment is not finite before a step; the other one goes on."""
+    """Make the first environment non-finite before a step; the other one continues."""
     batch, actions = vector.batch, random_actions()
 
     def episode(broken_at: int | None) -> list[core.Transition]:

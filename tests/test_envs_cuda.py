@@ -1,4 +1,4 @@
-"""Batched environments on CUDA: tensors on the device, the CPU's gradients; recorded updates."""
+"""Batched environments on CUDA: tensors on the device, gradients as on the CPU, captured updates."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def env() -> TensorEnv:
 
 @pytest.mark.parametrize("own_stream", [False, True])
 def test_tensors_stay_on_the_device(env: TensorEnv, own_stream: bool) -> None:
-    """Also where PyTorch works in another stream than Taichi."""
+    """Include a PyTorch stream that differs from Taichi's."""
     actions = 2.0 * np.random.default_rng(0).random((4, 2, 6)) - 1.0
     wants = [env.batch.reset()[0], *(env.batch.step(action) for action in actions)]
     with torch.cuda.stream(torch.cuda.Stream() if own_stream else torch.cuda.default_stream()):
@@ -47,7 +47,7 @@ def test_tensors_stay_on_the_device(env: TensorEnv, own_stream: bool) -> None:
 
 @pytest.mark.parametrize("at", [0, 1])
 def test_what_breaks_off_rests_on_the_device(env: TensorEnv, at: int) -> None:
-    """The first environment is not finite before a step; the other one goes on."""
+    """Make the first environment non-finite before a step; the other one continues."""
     actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(4, 2, 6)
     env.reset()
     whole = [env.step(action, strict=False) for action in actions]
@@ -85,7 +85,7 @@ def test_gradients_of_tensors_stay_on_the_device() -> None:
 
 @pytest.mark.parametrize("envs", [2, 512])
 def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
-    """Also where there are so many particles that they are put into the order of their cells."""
+    """Include scenes with so many particles that they are sorted by cell."""
     gradients = []
     for device, size in (("cpu", 2), ("cuda", envs)):
         episodes = EpisodeBatch([config(device)] * size, contact="soft")

@@ -1,4 +1,4 @@
-"""Fuzzing: result files and archives with any bytes changed are read, or refused in one line; nightly."""
+"""Fuzzing: result files and archives with changed bytes are read or refused in one line; nightly."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.nightly
 
 
 def answered(reading: Callable[[], Any]) -> None:
-    """Read something, or be refused in a short line."""
+    """Read a file, or be refused in a short line."""
     try:
         reading()
     except PlabError as error:
@@ -34,7 +34,7 @@ def answered(reading: Callable[[], Any]) -> None:
 
 
 def made(folder: Path, *, packed: bool) -> Path:
-    """Write a stopped run with a mass tensor and a state, or an archive of two finished ones."""
+    """Write a stopped run with a mass tensor and a state, or an archive of two finished runs."""
     run = synthetic.run(folder / "runs")
     run.masses = {"final": np.pad(np.full((2, 2, 2), 0.5), 31)}
     run.status, run.message, run.evaluation = "stopped", "interrupted", {}
@@ -49,7 +49,7 @@ def made(folder: Path, *, packed: bool) -> Path:
 
 
 def read_all(path: Path) -> None:
-    """Do with a result file or an archive all that is done with one."""
+    """Apply every reader to a result file or an archive."""
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
         load(path, index=False)

@@ -1,4 +1,4 @@
-"""Layering of the packages, imports of the command lines, and public names."""
+"""Layering of packages, imports of the command lines, and public names."""
 
 from __future__ import annotations
 

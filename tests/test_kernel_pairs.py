@@ -1,6 +1,6 @@
-"""Phases written twice, for the CPU by tiles and for CUDA by particle or manipulator, compute the same.
+"""Equivalence of phases implemented twice: for the CPU by tiles, and for CUDA by particle or manipulator.
 
-Functions for CUDA that use nothing of warps are compiled for the CPU here, with the CPU's layout of tiles.
+CUDA functions without warp operations are compiled for the CPU here, with the CPU's tile layout.
 """
 
 import math
@@ -79,7 +79,7 @@ class Tiles(CpuPhases):
 
 @ti.data_oriented
 class Threads(CudaPhases):
-    """CUDA's phases, one at a time, and one particle after the other where warps would scatter together."""
+    """CUDA's phases, one at a time, and particle by particle where warps would scatter jointly."""
 
     @ti.func
     def scatter_alone(self, grid: ti.template(), e, base, fx, field: ti.template()):
@@ -167,14 +167,14 @@ def pair() -> tuple[Tiles, Threads]:
 
 
 def launch(phases: Tiles | Threads, name: str, *arrays: ti.Ndarray) -> None:
-    """Call a kernel; those of the CPU take each array's address, too."""
+    """Call a kernel; CPU kernels also take the address of each array."""
     if isinstance(phases, Tiles):
         arrays = [part for one in arrays for part in (one, address_of(one))]
     getattr(phases, name)(*arrays)
 
 
 def tiles_of(values: np.ndarray, lanes: int) -> np.ndarray:
-    """Values [..., batch, particle, STATE] as tiles, [..., batch, tile, STATE, lane], padded with rest."""
+    """Convert values [..., batch, particle, STATE] to padded tiles [..., batch, tile, STATE, lane]."""
     *front, particles, _ = values.shape
     count = -(-particles // lanes)
     out = np.zeros((*front, count * lanes, STATE))
@@ -190,14 +190,14 @@ def array(phases: Tiles | Threads, values: np.ndarray) -> ti.Ndarray:
 
 
 def particles_of(phases: Tiles | Threads, tiles: ti.Ndarray) -> np.ndarray:
-    """The particles of tiles, [slot, batch, particle, STATE]."""
+    """Particles of tiles, [slot, batch, particle, STATE]."""
     values = tiles.to_numpy().reshape(-1, phases.batch, phases.tiles, STATE, phases.lanes)
     flat = np.moveaxis(values, -1, -2).reshape(len(values), phases.batch, -1, STATE)
     return flat[:, :, : phases.particles]
 
 
 def drawn(phases: Tiles) -> SimpleNamespace:
-    """A random state of which some particles leave the domain, adjoints, and fields of the grid."""
+    """Random state in which some particles leave the domain, adjoints, and grid fields."""
     rng = np.random.default_rng(5)
     shape = (2, phases.batch, phases.particles)
     state = np.concatenate(
@@ -219,7 +219,7 @@ def drawn(phases: Tiles) -> SimpleNamespace:
 
 
 def taken(phases: Tiles | Threads, field: ti.Field) -> np.ndarray:
-    """Sums of each environment in a field that chunks share out on the CPU; the field is cleared."""
+    """Sums of each environment in a field that chunks share on the CPU; the field is cleared."""
     values = field.to_numpy()
     field.fill(0.0)
     if isinstance(phases, Threads):

@@ -1,4 +1,4 @@
-"""Simulated runs that die at any change of a file end, resumed, with the files of undisturbed ones."""
+"""Simulated runs that are killed at any file operation and resumed equal undisturbed runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ progress=false
 
 
 def died(cfgs: list[Config], folder: Path, event: Failing) -> bool:
-    """Carry out runs; returns whether they died."""
+    """Execute runs; return whether they died."""
     try:
         with watched(folder, event):
             assert all(one.finished for one in run_batch(cfgs, cache=CACHE))

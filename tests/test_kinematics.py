@@ -1,4 +1,4 @@
-"""Links that follow twists, articulated models, and actions in joint space."""
+"""Links that follow twists, articulated models, and joint-space actions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def small(*manipulators: Manipulator, **changes) -> Scene:
 
 @pytest.mark.nightly
 def test_links_move_as_the_rules_of_the_suite_do(device: str) -> None:
-    """A box and a sphere by their own rules, and as links by twists: the same states and gradients."""
+    """A box and a sphere have the same states and gradients by their own rules and as links."""
     tilt = (np.cos(0.2), 0.0, 0.0, np.sin(0.2))
     box = Manipulator("Box", (0.04, 0.05, 0.06), (0.42, 0.33, 0.5), tilt, scale=(0.03,) * 3 + (0.2,) * 3)
     ball = Manipulator("Sphere", (0.05,), (0.6, 0.33, 0.5), scale=(0.02,) * 3)
@@ -91,7 +91,7 @@ def placed(free: bool = False, position=(0.28, 0.0, 0.5), **options) -> Chain:
 
 @pytest.mark.parametrize(("model", "root"), [(ARM, "world"), (HAND, "robot0:hand mount")])
 def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
-    """Frames of all links, by NumPy and by PyTorch, at random joint positions."""
+    """Compare the frames of all links in NumPy and PyTorch at random joint positions."""
     package, _, inside = model.partition(":")
     compiled = mujoco.MjModel.from_xml_path(f"{find_spec(package).submodule_search_locations[0]}/{inside}")
     data = mujoco.MjData(compiled)
@@ -130,7 +130,7 @@ MESH = f'<collision>{AT}<geometry><mesh filename="{{}}"/></geometry></collision>
 
 
 def test_a_urdf_arm_has_boxes_and_capsules_around_its_meshes(tmp_path: Path) -> None:
-    """A plate becomes a box, a bar a capsule of its length, where the joint turns them."""
+    """A plate becomes a box, a bar a capsule of equal length, rotated by the joint."""
     halves = {"plate.obj": (0.1, 0.01, 0.05), "bar.obj": (0.1, 0.01, 0.012)}
     for name, half in halves.items():
         trimesh.creation.box(2 * np.array(half)).export(tmp_path / name)
@@ -151,7 +151,7 @@ def test_a_urdf_arm_has_boxes_and_capsules_around_its_meshes(tmp_path: Path) -> 
 
 @pytest.fixture(scope="module")
 def arm(device: str) -> Simulator:
-    """Two environments with a ball of their own and an arm on a free base that reaches into the body."""
+    """Two environments, each with its own ball and an arm on a free base that reaches into the body."""
     start = {"shoulder": 0.35, "elbow": 1.75, "wrist": 0.4}
     ball = Manipulator("Sphere", (0.05,), (0.5, 0.33, 0.58), scale=(0.02,) * 3)
     scenes = []
@@ -166,7 +166,7 @@ def arm(device: str) -> Simulator:
 
 
 def test_the_gradient_by_joint_actions(arm: Simulator) -> None:
-    """Against central differences, component by component, and that of a closed loop which replays them."""
+    """Compare with central differences by component, and with a closed loop that replays the actions."""
     names = arm.scenes[0].action_names
     assert names[2:4] == ("0_z", "base_x") and names[-1] == "grip" and len(names) == arm.action_dim == 15
     actions = np.random.default_rng(0).uniform(-0.5, 0.5, (2, STEPS, 15))
@@ -208,7 +208,7 @@ def test_the_gradient_by_joint_actions(arm: Simulator) -> None:
 
 @pytest.mark.parametrize("task", EXTENSION_TASKS)
 def test_every_extension_task_has_a_known_solution(task: str) -> None:
-    """Of five variants and of random ones; no two are the same."""
+    """Check five variants and random ones, all different."""
     words = [[f"variant={v}"] for v in SUITE_VARIANTS] + [
         ["variant=random", f"seed_scene={s}"] for s in (0, 1)
     ]
@@ -222,7 +222,7 @@ COARSE = ("sim.grid_size=16", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_sc
 
 @pytest.mark.nightly
 def test_an_arm_is_one_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a task with an articulated model: a run, its demonstration, environments, and what is refused."""
+    """Test a run, its demonstration, environments and refusals for a task with an articulated model."""
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
     words = ["task=Gripper", *COARSE]
     cfg = load_config(words)

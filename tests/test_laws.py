@@ -41,19 +41,19 @@ def coefficients(law: Law) -> list[float]:
 
 
 def deformed(strain: float) -> tuple[np.ndarray, np.ndarray]:
-    """C and F of particles, [9, particle], compressed a little."""
+    """C and F of slightly compressed particles, [9, particle]."""
     rng = np.random.default_rng(0)
     f = 0.99 * np.eye(3).reshape(9, 1) + strain * rng.normal(size=(9, COUNT))
     return 30.0 * rng.normal(size=(9, COUNT)), f
 
 
 def table(values: object) -> np.ndarray:
-    """Components, some of which are one number for all particles, as [component, particle]."""
+    """Array [component, particle] of components, some of which are constant."""
     return np.array(np.broadcast_arrays(*values, np.zeros(COUNT))[: len(values)])
 
 
 def updated(law: Law, c: np.ndarray, f: np.ndarray, *own: object) -> tuple[np.ndarray, np.ndarray]:
-    """A (9) and the new F (9)."""
+    """A (9) and the new F (9) of particles."""
     materials = pytest.importorskip("plab.sim.codegen.materials")
     tau, new = law.update(c, f, DT, *own)
     return table(materials.scattered_matrix(tau, c, *CONSTANTS[1:])), table(new)
@@ -63,7 +63,7 @@ def updated(law: Law, c: np.ndarray, f: np.ndarray, *own: object) -> tuple[np.nd
 
 
 def sheared(law: Law, own: list[float], rate: float, steps: int, squeeze: float = 1.0) -> np.ndarray:
-    """Kirchhoff stress (6) after steps of simple shear in the plane of x and y."""
+    """Kirchhoff stress (6) after steps of simple shear in the xy plane."""
     c, f = np.zeros(9), squeeze * np.eye(3).reshape(9)
     c[1] = rate
     for _ in range(steps):
@@ -91,7 +91,7 @@ def test_shear_follows_closed_forms() -> None:
 
 
 def test_triaxial_compression_of_sand_fails_by_mohr_and_coulomb() -> None:
-    """The smaller principal stress is (1 - sin phi) / (1 + sin phi) of the larger."""
+    """The smaller principal stress is (1 - sin phi) / (1 + sin phi) times the larger one."""
     sand = LAWS["drucker_prager"]
     for angle in (20.0, 35.0):
         f = np.diag([0.98, 1.004, 1.004]).reshape(9)
@@ -112,7 +112,7 @@ def test_separated_sand_carries_nothing_until_it_is_back_at_its_volume() -> None
 
 
 def principal_stress(law: str, strain: np.ndarray, own: list[float]) -> np.ndarray:
-    """Principal Kirchhoff stresses after a substep from principal Hencky strains, in closed form."""
+    """Principal Kirchhoff stresses after a substep, in closed form, given principal Hencky strains."""
     mu, lam, *more = own
     trace, j = strain.sum(), math.exp(strain.sum())
     if law == "elastic":
@@ -178,7 +178,7 @@ def test_a_bingham_body_rests_below_its_yield_stress_and_slumps_above() -> None:
 @pytest.mark.parametrize("name", [name for name in ALL if name != "von_mises"])
 @pytest.mark.parametrize("strain", [0.0, 1e-4, 0.01, 0.1])
 def test_adjoints_of_laws_are_central_differences(name: str, strain: float) -> None:
-    """By C, F and each coefficient, also where all stretches are equal."""
+    """Differentiate by C, F and each coefficient, also where all stretches are equal."""
     from plab.sim.codegen.materials import law_adjoint
 
     law, (c, f) = ALL[name], deformed(strain)
@@ -220,7 +220,7 @@ def test_parameters_are_differentiated_and_limit_the_time_step(name: str) -> Non
 
 
 def compiled(device: str, precision: str, law: Law, mixed: bool = False):
-    """A function that calls functions of a law's bitcode by name, with arrays whose addresses they take."""
+    """Function that calls a law's bitcode functions by name with arrays."""
     llvm = pytest.importorskip("llvmlite.binding")
     llvm.initialize()
     llvm.initialize_native_target()
@@ -242,7 +242,7 @@ def compiled(device: str, precision: str, law: Law, mixed: bool = False):
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 @pytest.mark.parametrize("name", [name for name in ALL if name != "von_mises"])
 def test_compiled_laws_compute_their_formulas(name: str, precision: str) -> None:
-    """A tile on the CPU, one with lanes of another law, and a particle on CUDA; forward and adjoint."""
+    """Check a tile on the CPU, a tile with two laws, and a particle on CUDA, forward and adjoint."""
     from plab.sim.codegen.materials import law_adjoint
     from plab.sim.storage import AT_C, AT_F, LAW_PARAMETER_BARS, STATE, STRAIN_LAW, STRAINS
 

@@ -1,4 +1,4 @@
-"""Terms of the loss: measures against plain formulas, gradients against differences, terms of one's own."""
+"""Loss terms: measures against plain formulas, gradients against differences, custom terms."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ SCENES = [scene(KINDS), scene(("Sphere", "Chopsticks"))]
 
 
 class Close(DistanceTerm):
-    """Smooth count of the particles close to a manipulator."""
+    """Smooth count of the particles near a manipulator."""
 
     @ti.func
     def add(self, accumulator, d, particle):
-        """One more share."""
+        """Add the contribution of one particle."""
         wide = ti.cast(d, ti.f64)
         return accumulator + ti.Vector([ti.exp(-wide * wide / 0.02), 0.0])
 
     @ti.func
     def measure(self, accumulator):
-        """The logarithm of the number."""
+        """Logarithm of the count."""
         return ti.log(1.0 + accumulator[0])
 
     @ti.func
     def slope(self, accumulator, d, particle):
-        """By the distance."""
+        """Derivative with respect to the distance."""
         wide = ti.cast(d, ti.f64)
         return -2.0 * wide / 0.02 * ti.exp(-wide * wide / 0.02) / (1.0 + accumulator[0])
 
 
 def with_tools(*kinds: str) -> list[Scene]:
-    """The scenes with some of their manipulators: kernels of all seven take longest to compile."""
+    """Scenes with only some of their manipulators, because kernels for all seven compile slowly."""
     return [replace(made, manipulators=tools(made, kinds)) for made in SCENES]
 
 
@@ -151,7 +151,7 @@ NAMES |= {"energy": "suite:Kinetic", "all": "all"}
 
 @pytest.fixture(scope="module")
 def full(device: str) -> Simulator:
-    """With all gradients, all terms, and every kind of motion."""
+    """Simulator with all gradients, all terms, and every kind of motion."""
     scenes = with_tools("Sphere", "RollingPin", "Chopsticks", "Box", "Cylinder")
     motions = {MANIPULATOR_SHAPES[m.shape].motion for m in scenes[0].manipulators}
     assert motions == {MANIPULATOR_SHAPES[kind].motion for kind in KINDS}
@@ -164,7 +164,7 @@ def full(device: str) -> Simulator:
 
 @pytest.mark.parametrize("every_step", [True, False])
 def test_functions_of_states_are_differentiated(every_step: bool, full: Simulator) -> None:
-    """By actions, initial positions and material, against central differences."""
+    """Compare derivatives by actions, initial positions and material with central differences."""
     simulator = full
     simulator.reset()
     rng = np.random.default_rng(0)
@@ -195,7 +195,7 @@ def test_functions_of_states_are_differentiated(every_step: bool, full: Simulato
 
 
 def test_measures_are_the_formulas_and_the_gradient_of_all_is_summed(full: Simulator) -> None:
-    """That is no gradient: 2 w D sum of grad d_p over the particles outside, and D as its measure."""
+    """Term ``all`` has no true gradient: 2 w D sum of grad d_p over particles outside, measure D."""
     full.reset()
     rng = np.random.default_rng(0)
     shape = (full.batch, *[full.grid_size] * 3)

@@ -1,5 +1,4 @@
-"""Bodies of different laws in one scene, and a scene of one law: against the plain reference and central
-differences."""
+"""Scenes with one or several laws, against the reference and central differences."""
 
 from __future__ import annotations
 
@@ -24,11 +23,11 @@ OWN = {
 }
 SAND = pytest.param(("drucker_prager",), id="sand", marks=pytest.mark.nightly)
 WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)
-"""Steps as shares of a value: wide ones cross kinks of yield and contact, narrow ones drown in rounding."""
+"""Relative steps: large ones cross kinks of yield and contact, small ones are dominated by rounding."""
 
 
 def layered(laws: tuple[str, ...]) -> Scene:
-    """The box of :mod:`suite` in layers of a law each, whose tiles have particles of several."""
+    """The box of :mod:`suite` in layers with different laws, whose tiles mix particles of several laws."""
     whole = suite.scene(suite.KINDS)
     x, y, z = whole.bodies[0].center
     height = suite.WIDTH / len(laws)

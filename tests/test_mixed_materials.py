@@ -1,5 +1,4 @@
-"""Bodies of different materials in one scene: against the plain reference, central differences, and scenes of
-one material."""
+"""Bodies with different materials, against the reference, differences and uniform scenes."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ SOFT = {"youngs_modulus": 800.0, "yield_stress": 15.0}
 
 
 def halves(left: dict[str, float], right: dict[str, float], particles: tuple[int, int], **changes) -> Scene:
-    """The box of plasticine of :mod:`suite`, whose halves along x are two bodies, and a sphere."""
+    """The plasticine box of :mod:`suite`, divided into two bodies along x, and a sphere."""
     whole = suite.scene(suite.KINDS, particles=sum(particles), **changes)
     x, y, z = whole.bodies[0].center
     edges = (suite.WIDTH / 2, suite.WIDTH, suite.WIDTH)
@@ -62,7 +61,7 @@ def simulator(compiled: Simulator) -> Simulator:
 
 
 def start(simulator: Simulator, strain: float) -> State:
-    """A moving start with singular values that differ: by ``strain``, of which 0.15 is beyond the series."""
+    """Moving state with distinct singular values; a ``strain`` of 0.15 is out of the series' range."""
     rng = np.random.default_rng(11)
     rest = simulator.state()
     v, c = rng.normal(size=rest.v.shape), rng.normal(scale=20.0, size=rest.C.shape)
@@ -88,9 +87,10 @@ def test_states_and_gradients_are_those_of_the_reference(simulator, strain):
 
 
 def differences(simulator: Simulator, key: str, body: int, width: float) -> np.ndarray:
-    """Central differences of the losses, shape [batch], by one value of one body of each environment.
+    """Central differences of the losses, shape [batch], with respect to one value of one body per
+    environment.
 
-    ``width`` is that of the step, as a share of the value.
+    ``width`` is the relative step.
     """
     values = np.array([[getattr(m, key) for m in scene.materials] for scene in SCENES])
     step = np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""Model-predictive control: what is executed is what is judged, runs resume, planners are exchanged."""
+"""Model-predictive control: executed actions are evaluated, runs resume, planners are interchangeable."""
 
 from __future__ import annotations
 

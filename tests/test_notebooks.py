@@ -1,7 +1,7 @@
-"""Notebooks in examples/: kept without outputs, executed, their numbers as their text says.
+"""Notebooks in examples/: stored without outputs, executable, with numbers as in their text.
 
-They are .ipynb, which Jupyter, editors and GitHub open as they are. Those in reports/ are text, because a
-command executes them. That they import what there is, test_docs.py sees.
+They are .ipynb files, which Jupyter, editors and GitHub open directly. Notebooks in reports/ are text,
+because a command executes them. test_docs.py checks the imports.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ def test_notebooks_have_no_outputs_and_their_links_lead_somewhere(name):
 
 
 class Outputs:
-    """Outputs of a notebook that is executed in a process of its own, in a copy of examples/.
+    """Outputs of a notebook executed in a separate process, in a copy of examples/.
 
     Attributes:
-        text: Everything printed, and results as text, one after the other.
-        views: Content of each viewer: steps, and scores after each of them.
+        text: Printed text and text results, in order.
+        views: Content of each viewer: steps, and the score after each step.
     """
 
     def __init__(self, name: str, folder: Path) -> None:
@@ -88,7 +88,7 @@ class Outputs:
         self.views = [json.loads(re.search(r"const rollout = (.*);", page)[1]) for page in pages]
 
     def numbers(self, pattern: str) -> list[float]:
-        """Return the numbers that stand where a pattern has ``#``, of its only place in the text."""
+        """Return the numbers in place of ``#`` in a pattern, which must match the text once."""
         number = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
         (found,) = re.findall(re.escape(pattern).replace(r"\#", number), self.text)
         return [float(one) for one in ([found] if isinstance(found, str) else found)]

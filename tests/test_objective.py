@@ -54,7 +54,7 @@ def naive_kernel(distance: float) -> float:
 
 
 def naive_mass(x: np.ndarray, n: int, mass: float) -> np.ndarray:
-    """Visit every node for every particle, with a layer of ghost nodes below 0 that is folded onto node 0."""
+    """Mass tensor by visiting all nodes for each particle; ghost nodes below 0 are added to node 0."""
     grid = np.zeros((n, n, n))
     for p in x:
         for node in np.ndindex(n + 1, n + 1, n + 1):
@@ -132,7 +132,7 @@ def box_of_mass(low, high, n=32):
 
 
 def test_target_observation():
-    """Of boxes that do not touch all mass has to go; half of a box may stay if only that has to move."""
+    """Disjoint boxes require moving all mass; for half a box, half of the mass may stay."""
     start, target = box_of_mass((4, 6, 8), (8, 12, 16)), 3.0 * box_of_mass((20, 8, 18), (26, 12, 22))
     seen = target_observation(start, target)
     assert seen.shape == (TARGET_ENTRIES,)

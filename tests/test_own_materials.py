@@ -25,7 +25,7 @@ def blocks(language: str) -> list[str]:
 
 
 def arguments(line: str) -> list[str]:
-    """Arguments of a ``plab run`` line of the page, with the example's folder where it is."""
+    """Arguments of a ``plab run`` line of the page, with the path of the example's folder."""
     words = shlex.split(line.removeprefix("$ "))
     assert words[:2] == ["plab", "run"]
     return [str(ROOT / word) if word.startswith("examples/") else word for word in words[2:]]

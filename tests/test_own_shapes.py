@@ -1,4 +1,4 @@
-"""Shapes from files: the runs of docs/own_shapes.md, meshes, targets, provenance, and what is refused."""
+"""Shapes from files: the runs of docs/own_shapes.md, meshes, targets, provenance and refusals."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def obj(vertices: np.ndarray, faces: list[tuple[int, ...]] = SIDES) -> str:
 
 
 def two(second: np.ndarray, faces: list[tuple[int, ...]] = SIDES) -> str:
-    """The unit box and another one."""
+    """The unit box and another box."""
     return obj(np.concatenate([BOX, second]), [*SIDES, *(tuple(k + 8 for k in face) for face in faces)])
 
 
@@ -74,7 +74,7 @@ def write(content: str | bytes, name: str = "it.obj") -> str:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
-    """A folder with what the example's script writes."""
+    """Folder with the files that the example's script writes."""
     folder = tmp_path_factory.mktemp("files")
     with contextlib.chdir(folder):
         runpy.run_path(str(EXAMPLE / "star.py"))
@@ -198,7 +198,7 @@ def test_particles_of_a_mesh(start):
 
 
 def test_targets_of_the_example(files, monkeypatch):
-    """A mesh in its place; points and masses that are the same solid; all of the scene's mass."""
+    """A positioned mesh, and points and masses of the same solid, with all of the scene's mass."""
     monkeypatch.chdir(files)
     cfgs = [example(), *(example(f"variant={k}", "sim=coarse") for k in (2, 3))]
     scenes = [build_scene(cfg) for cfg in cfgs]

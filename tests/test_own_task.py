@@ -1,4 +1,4 @@
-"""A config folder of the user's own: lines of docs/own_task.md, names, and mistakes in its files."""
+"""A user's config folder: commands of docs/own_task.md, names, and errors in its files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def own(tmp_path) -> Callable[..., Path]:
-    """Write a folder with one task, made from the example by replacing pieces of text."""
+    """Write a folder with one task, derived from the example by replacing strings."""
 
     def write(*pieces: tuple[str, str], name: str = "Dumbbell") -> Path:
         text = DUMBBELL

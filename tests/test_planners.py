@@ -1,4 +1,4 @@
-"""Planners: the rule of each on a quadratic loss, runs on a coarse scene, contact starts, mistakes."""
+"""Planners: the rule of each on a quadratic loss, runs on a coarse scene, contact starts, invalid values."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ START = CandidateStart(
 
 
 def rule(name: str, *overrides: str) -> MethodConfig:
-    """Section ``method`` of a planner of five candidates."""
+    """``method`` section of a planner with five candidates."""
     words = [f"method={name}", "method.population=5", *(f"method.{word}" for word in overrides)]
     return load_config(words).method
 
@@ -55,7 +55,7 @@ def random(iteration: int) -> torch.Generator:
 
 
 def judged(request: Request, broken: Sequence[int] = ()) -> Answer:
-    """Squared distances from a goal, with a score that falls with the distance of the last step alone."""
+    """Squared distances from a goal, and a score that depends only on the distance at the last step."""
     away = request.actions - GOAL
     loss, final = away.square().sum((1, 2)), away[:, -1].square().sum(1)
     lost = torch.zeros(len(loss), dtype=torch.bool)
@@ -65,7 +65,7 @@ def judged(request: Request, broken: Sequence[int] = ()) -> Answer:
 
 
 def iterate(search, iteration: int, broken: Sequence[int] = ()) -> tuple[list[Request], tuple]:
-    """Requests of one iteration, and the best of it."""
+    """Requests of one iteration, and its best candidate."""
     walk, requests = search.plan(random(iteration)), []
     answer = None
     try:
@@ -89,7 +89,7 @@ def best_of(actions: torch.Tensor) -> torch.Tensor:
 
 
 def drawn(mean: torch.Tensor, std: torch.Tensor | float, iteration: int, best: torch.Tensor) -> torch.Tensor:
-    """Normal draws, of which the first is the best so far instead."""
+    """Normal samples, the first replaced by the best so far."""
     noise = torch.randn((5, *SHAPE), generator=random(iteration), dtype=torch.float64)
     points = (mean + std * noise).clamp(-1.0, 1.0)
     points[0] = best
@@ -245,7 +245,7 @@ METHODS: dict[str, tuple[str, ...]] = {
         "method.stages.polish={population: 4, iterations: 2}",
     ),
 }
-"""All with four candidates, so that one simulator serves all, and two runs of which two are tried at once."""
+"""All with four candidates, so that they share one simulator."""
 
 OTHER = ("variant=3", "seed=2", "task.yield_stress=20")
 
@@ -270,7 +270,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
-    """Uninterrupted runs by method, of another variant, seed and material."""
+    """Uninterrupted runs by method, with another variant, seed and material."""
     folder = tmp_path_factory.mktemp("others")
     return {method: run(make_config(folder, method, *OTHER)) for method in METHODS}
 
@@ -296,7 +296,7 @@ def test_a_run_improves_on_its_start_and_tells_what_it_cost(finished, method: st
 
 
 def stop_before(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
-    """Let runs end before the row of an iteration, as if their process did."""
+    """Stop runs before the row of an iteration, as if their process had ended."""
     intact = planner.PlannerRunner.iterate
 
     def iterate(self, tracks):
@@ -355,7 +355,7 @@ def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypa
 
 @pytest.fixture
 def halved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory with room for half of two runs' candidates, which are tried in two parts."""
+    """Memory for half of the candidates of two runs, which are evaluated in two parts."""
     monkeypatch.setattr("plab.sim.memory.batch_limit", lambda *_: 4)
 
 
@@ -374,7 +374,7 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
     scores = [results["cem"].iterations["score"].tolist() for results in (finished, others)]
 
     def until(enough: float) -> list[list[float]]:
-        """Scores up to the first that is enough, of each run."""
+        """Scores of each run up to the first that is sufficient."""
         ends = [next((k for k, one in enumerate(own) if one >= enough), len(own)) for own in scores]
         return [own[: end + 1] for own, end in zip(scores, ends, strict=True)]
 

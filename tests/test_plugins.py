@@ -1,4 +1,4 @@
-"""Objects that a configuration names as module:NAME: search path, mistakes, a method from outside."""
+"""Objects named as module:NAME in a configuration: search path, errors, an external method."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from toy_runner import COARSE
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A config folder of the user's, whose modules are forgotten afterwards."""
+    """The user's config folder, whose modules are forgotten afterwards."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     conf = tmp_path / "own" / "conf"
     (conf / "method").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Learning without a simulator: agents beside Stable-Baselines3, replay buffers, batches."""
+"""Learning without a simulator: agents compared with Stable-Baselines3, replay buffers, batches."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ LEARNERS = {
 
 
 class Script(gymnasium.Env):
-    """Says what it was told to say."""
+    """Environment with scripted observations and rewards."""
 
     observation_space, action_space = SPACES
 
@@ -76,7 +76,7 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
 
 
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:
-    """Let agents learn from scripts, and return the random numbers that they drew, in the order of use."""
+    """Let agents learn from scripts; return the random numbers that they used, in order."""
     tapes: dict[str, list[Any]] = {"normal": [], "uniform": [], "integers": [], "permutation": []}
     original = agents.draws.draw
 
@@ -90,7 +90,7 @@ def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarr
 
 
 def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
-    """Let agents draw number by number, and learn from scripts."""
+    """Let agents learn from scripts, with random numbers one at a time."""
     agents.draws.block = lambda use, kind, *shape: agents.draws.draw(kind, *shape)
     told = iter(torch.from_numpy(observations).to(agents.device).unbind(1))
     now = next(told)
@@ -104,7 +104,7 @@ def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
 
 
 class Observed(RunningMeanStd):
-    """Statistics of the observations of the very first start and of some transitions."""
+    """Statistics of the initial observations and of some transitions."""
 
     def __init__(self, transitions: float) -> None:
         super().__init__(shape=(OBSERVED,))
@@ -117,7 +117,7 @@ class Observed(RunningMeanStd):
 
 
 class Decay:
-    """A learning rate of which ``remaining`` says how much is left."""
+    """Learning rate that follows ``remaining``."""
 
     def __init__(self, lr: float) -> None:
         self.lr, self.remaining = lr, 1.0
@@ -127,7 +127,7 @@ class Decay:
 
 
 def library(cfg: Config, observations: np.ndarray, rewards: np.ndarray) -> BaseAlgorithm:
-    """Stable-Baselines3's model with the method's numbers and first policy."""
+    """Stable-Baselines3's model with the method's numbers and initial policy."""
     m: Any = cfg.method
     truncates = getattr(m, "bootstrap", True)
     env: VecEnv = DummyVecEnv(
@@ -169,14 +169,14 @@ def library(cfg: Config, observations: np.ndarray, rewards: np.ndarray) -> BaseA
 
 
 def feed(model: BaseAlgorithm, tapes: dict[str, list[Any]], agent: int, patch: pytest.MonkeyPatch) -> None:
-    """Give a model an agent's random numbers."""
+    """Feed an agent's random numbers to a model."""
     queues = {kind: deque(np.asarray(d[agent]) for d in drawn) for kind, drawn in tapes.items()}
     method = getattr(model, "replay_buffer", None)
 
     rows: deque[np.ndarray] = deque()
 
     def each(kind: str) -> np.ndarray:
-        """The library draws for each environment by itself."""
+        """The library samples separately for each environment."""
         if not rows:
             rows.extend(queues[kind].popleft())
         return rows.popleft()
@@ -216,7 +216,7 @@ def make_scripts() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_agents_learn_what_stable_baselines3_learns(name: str, monkeypatch) -> None:
-    """From the same first networks, observations, rewards and random numbers, over 27 updates and more."""
+    """Start from the same networks, observations, rewards and random numbers; make at least 27 updates."""
     scripts = make_scripts()
     agents, cfgs = learner(name)
     first = [p.clone() for p in agents.parameters()]
@@ -244,7 +244,7 @@ def test_agents_learn_what_stable_baselines3_learns(name: str, monkeypatch) -> N
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", LEARNERS)
 def test_stacks_on_cuda_learn_what_those_on_the_cpu_learn(name: str) -> None:
-    """From the same data and random numbers; updates are recorded after the third and replayed."""
+    """Use the same data and random numbers; updates are captured after the third and replayed."""
     scripts = make_scripts()
     (agents, _), (others, _) = learner(name), learner(name, "cuda")
     first = [p.detach().clone() for p in agents.parameters()]
@@ -270,7 +270,7 @@ def distinct(rows: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("buffer_size", [1000, 24])
 def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_size: int) -> None:
-    """Each of the latest transitions can be sampled, and nothing else, before and after."""
+    """Exactly the latest transitions can be sampled before and after."""
     sizes, agents, steps = Sizes(envs=2, horizon=4, observed=3, actions=1), 2, 38
     rng, window = np.random.default_rng(0), buffer_size // 2
     observations = torch.from_numpy(rng.normal(size=(steps + 10, agents, 2, 3)).astype(np.float32))

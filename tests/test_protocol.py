@@ -1,4 +1,4 @@
-"""The release's choices: start, floor, contact gradient, exact numbers, score."""
+"""The release's conventions: start, floor, contact gradient, exact numbers and score."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FIELDS = {"start": "sampling_convention", "numbers": "digits_convention", "floor
 
 
 def released(near: tuple[str, ...], **changes: float) -> Scene:
-    """A box on the floor as the release has it, the named manipulators at it, the others far away."""
+    """A box on the floor under the release's conventions, touched by the named manipulators."""
     made = scene(near, floor=True, **changes)
     drop = np.array([0.0, CENTER[1] - made.bodies[0].center[1], 0.0])
     lowered = tuple(

@@ -1,4 +1,4 @@
-"""Random variants: ranges, dependence on the seed, refusals."""
+"""Random variants: ranges, dependence on the seed, and refusals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plab.config.compose import compose
 from plab.config.randomization import FIRST_TARGET_SEED, draw_variant
 
 SCENES = 12
-"""Draws of each task, of which the least and the largest are more than half of a range apart."""
+"""Number of samples per task; their extremes are more than half of a range apart."""
 
 
 def draw(seed_scene: int, *overrides: str, task: str = "Rope") -> TaskConfig:
@@ -60,7 +60,7 @@ def test_ranges_are_respected_and_used(name: str) -> None:
 
 
 def test_move_triple_move_and_rope():
-    """Manipulators stay beside the ball; three targets are within reach and apart; Rope draws its pillar."""
+    """Manipulators stay next to the ball; targets are within reach and apart; Rope samples its pillar."""
     move = draw(5, task="Move")
     x, y, z = move.bodies["ball"].center
     assert move.manipulators["left"].position == pytest.approx([x - 0.1, y, z])
@@ -79,7 +79,7 @@ def test_move_triple_move_and_rope():
 
 
 def test_the_same_on_every_machine():
-    """The numbers themselves: a change of them silently changes everyone's benchmark."""
+    """Check the numbers themselves, because a change would silently alter everyone's benchmark."""
     assert draw(7).manipulators["pillar"].position == [0.4747, 0.0, 0.4216]
     torus = draw(7, task="Torus")
     assert torus.bodies["dough"].center == [0.554, 0.05, 0.4378]

@@ -1,4 +1,4 @@
-"""Hand-computed values of the oracle."""
+"""Reference implementation against hand-computed values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDENTITY = torch.eye(3, dtype=torch.float64)
 
 
 def make_scene(**changes: object) -> Scene:
-    """A block of 40 particles in mid-air on a coarse grid."""
+    """Block of 40 particles in mid-air on a coarse grid."""
     scene = Scene(
         "test",
         bodies=(Body("box", (0.5, 0.5, 0.5), (0.25, 0.2, 0.25), 40),),

@@ -1,4 +1,4 @@
-"""Refusals: one line on standard error, exit code 2, the key or file at fault by name, nothing written."""
+"""Refusals: exit code 2, one line on standard error that names the key or file, nothing written."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MISSING = graphics.missing_graphics
 
 @pytest.fixture(autouse=True)
 def on_some_computer(tmp_path, monkeypatch):
-    """In an empty folder of a computer with 16 GB of memory, and with graphics."""
+    """Use an empty folder on a computer with 16 GB of memory and with graphics."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(graphics, "missing_graphics", lambda: None)
     monkeypatch.setattr("plab.sim.memory.device_bytes", lambda device: 16e9)
@@ -86,7 +86,7 @@ COMPOSED = {
     "variant=random targets.source=.": "targets.source",
     "targets.source=files task.target.radius=0.2": "task.target.radius=0.2",
 }
-"""Overrides, and what the answer names."""
+"""Overrides, and the names in the message."""
 
 RUN = {
     "task=Ropee": "did you mean Rope?",
@@ -114,7 +114,7 @@ RUN = {
     "-m seed=0,1 hydra.launcher.per_gpu=-1": "hydra.launcher.per_gpu",
     "-m seed=0,1 hydra.launcher.inner=3": "hydra.launcher.inner",
 }
-"""Arguments, and what the answer names."""
+"""Arguments, and the names in the message."""
 
 
 @pytest.mark.parametrize("argv", COMPOSED)
@@ -162,7 +162,7 @@ TOOLS = [
     (bench.main, "sped", "did you mean speed?"),
     (plab_main, "rnu", "choose from: run"),
 ]
-"""Command lines, their arguments, and what the answer names."""
+"""Command lines, their arguments, and the names in the message."""
 
 
 @pytest.mark.parametrize(("entry", "argv", "named"), TOOLS)

@@ -1,4 +1,4 @@
-"""Pictures: surfaces, manipulators, camera, pixels of things drawn, files, the command line."""
+"""Pictures: surfaces, manipulators, camera, pixels of rendered objects, files and the command line."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_the_camera_of_a_scene_sees_manipulators_and_target():
 
 @pytest.fixture(scope="module")
 def pictures() -> Iterator[dict[str, np.ndarray]]:
-    """A cube with a sphere above it, the target beside it; and variations."""
+    """A cube with a sphere above it and the target next to it; and variations."""
     world, mass = scene(SPHERE), box_mass(GHOST)
     x, poses = sample_particles(world), start_poses(world)
     camera = scene_camera(world, mass, SIZE)
@@ -162,7 +162,7 @@ def pictures() -> Iterator[dict[str, np.ndarray]]:
 
 
 def color(pictures: dict, name: str, point: Sequence[float]) -> np.ndarray:
-    """Mean colour of the 3 x 3 pixels in which a point of the scene is seen."""
+    """Mean colour of the 3 x 3 pixels around a point of the scene."""
     column, row = np.floor(pictures["camera"].project(np.asarray(point), SIZE)).astype(int)
     return pictures[name][row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).mean(axis=0)
 
@@ -248,7 +248,7 @@ def test_films_as_gif_and_mp4(recording):
 
 @pytest.fixture
 def told(told) -> Callable[..., str]:
-    """One-line refusal of a command line of plab.render."""
+    """Message of a refused command line of plab.render."""
     return lambda *argv: told(argv, main)
 
 
@@ -269,7 +269,7 @@ def test_missing_packages_and_drivers_are_named(monkeypatch, told):
 
 @pytest.fixture
 def replayed(monkeypatch, recording) -> list:
-    """Take the recording instead of simulating; return what was to be simulated."""
+    """Use a recording instead of a simulation; return the requested rollouts."""
     asked = []
 
     def stand_in(cfg, actions):
@@ -317,7 +317,7 @@ def test_known_demonstrations_are_replayed_and_others_are_of_zeros(monkeypatch, 
 
 @pytest.mark.parametrize("position", [(0.5, 0.9, 1.7), (0.5, 2.0, 0.5)])
 def test_depth_and_labels_agree_with_pictures_to_a_pixel(position):
-    """Cameras of observations beside VTK's depth: things alone, from the front and from straight above."""
+    """Compare observation cameras with VTK's depth: single objects, from the front and from above."""
     camera = Camera(position, (0.45, 0.15, 0.5), 35.0, (128, 96))
     ball = Body("sphere", (0.4, 0.2, 0.5), (0.12,), 20000)
     one = scene(Manipulator("Sphere", (0.06,), (0.65, 0.1, 0.5), scale=(0.01,) * 3), bodies=(ball,))

@@ -1,4 +1,4 @@
-"""The report notebooks: measurements, notebooks with and without runs."""
+"""Report notebooks: measurements, and notebooks with and without runs."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_a_folder_without_runs_is_named(tmp_path: Path, told) -> None:
 
 @pytest.mark.nightly
 def test_notebooks_become_pages(tmp_path: Path) -> None:
-    """Execute all four in Jupyter's own way on what comes with plab."""
+    """Execute all four notebooks in Jupyter with the bundled results."""
     pytest.importorskip("nbclient")
     out = tmp_path / "out"
     assert main(["notebooks", "example", "--out", str(out)]) == 0

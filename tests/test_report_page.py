@@ -1,4 +1,4 @@
-"""The page of results: what it holds, and what it does in a real browser."""
+"""Results page: content, and behaviour in a real browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ drawing = pytest.mark.skipif(missing_graphics() is not None, reason=str(missing_
 
 
 def coarse_run(folder: Path, variant: str, name: str, seed: int, score: float) -> Path:
-    """Write the file of a made-up run whose actions can be replayed in no time."""
+    """Write the file of a synthetic run whose actions can be replayed quickly."""
     config = template(name, [f"results_dir={folder}", "task=Rope", f"variant={variant}", *COARSE])
     config["seed"] = seed
     return synthetic.save(synthetic_run(config, rows=6, score=score))
@@ -33,7 +33,7 @@ def coarse_run(folder: Path, variant: str, name: str, seed: int, score: float) -
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two methods on two variants, two seeds of one of them."""
+    """Runs of two methods on two variants, two seeds for one of them."""
     folder = tmp_path_factory.mktemp("results")
     for variant in "12":
         for seed in range(2):

@@ -1,4 +1,4 @@
-"""The paper's tables from results: numbers, intervals, what is missing, files."""
+"""The paper's tables from results: numbers, intervals, missing values and files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def score(task: str, variant: str, method: str, seed: int) -> float:
-    """Return a score that can be computed by head: 0.1 per variant, 0.01 per seed, a little per method."""
+    """Return a score that is easy to verify: 0.1 per variant, 0.01 per seed, a little per method."""
     lead = {"adam": 0.05, "gd": 0.0, "adam_h": 0.02, "ppo": 0.3}[method]
     return 0.1 * int(variant) + 0.01 * seed + lead
 
@@ -51,7 +51,7 @@ ADAM = np.array([score("Rope", v, "adam", s) for v in "12345" for s in range(3)]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All gradient runs of Rope but one, two runs of PPO, one unfinished, one of another variant."""
+    """All gradient runs of Rope except one, two PPO runs, an unfinished run, and a run of another variant."""
     results = tmp_path_factory.mktemp("results")
     for method in ("adam", "gd", "adam_h"):
         for variant in "12345":
@@ -321,7 +321,7 @@ AGREEMENT = {
     },
     "targets": {"all": ("150", "0.45", "43 %")},
 }
-"""Cells, correlation with the paper and share of the cells that agree; also in docs/reproduction.md."""
+"""Number of cells, correlation with the paper and agreement; also in docs/reproduction.md."""
 
 
 @pytest.mark.parametrize(

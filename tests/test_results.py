@@ -1,4 +1,4 @@
-"""Result files: round trip, hashes and paths, resumption, damage, loading."""
+"""Result files: round trip, hashes and paths, resumption, damage and loading."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from plab.results.run_file import COLUMNS, last_score
 
 
 def make_config(folder: Path, **changes) -> dict:
-    """Configuration of a run that is written after each iteration."""
+    """Configuration of a run that writes a checkpoint after each iteration."""
     return synthetic.config(folder, variant="2", seed=3) | {"checkpoint_seconds": 0.0} | changes
 
 
@@ -57,7 +57,7 @@ def finish_run(folder: Path, rng: np.random.Generator, **changes) -> RunFile:
 
 
 def begin_run(folder: Path, rng: np.random.Generator) -> RunFile:
-    """Record an iteration, then let go of the lock as a killed process would."""
+    """Record an iteration, then release the lock as if the process had been killed."""
     run = RunFile(make_config(folder))
     run.record(make_row(0), make_state(rng))
     run.release()

@@ -20,7 +20,7 @@ from plab.results import ResultsError, RunFile, RunResult, check, load, pack, re
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two finished runs, one with masses, and one that has stopped."""
+    """Two finished runs, one with masses, and a stopped run."""
     results = tmp_path / "results"
     mass = np.zeros((64, 64, 64))
     mass[3, 4, 5:9] = 0.5
@@ -140,7 +140,7 @@ def test_iterations_can_be_rounded(folder: Path, tmp_path: Path) -> None:
 
 
 def problem(path: Path) -> str:
-    """Return the problem found in a file; empty if there is none."""
+    """Return the fault found in a file, or an empty string."""
     ((_, found),) = check(path)
     return found
 

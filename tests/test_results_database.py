@@ -1,4 +1,4 @@
-"""Results as tables: as good as reading every file, only faster; SQL, scores and pictures of them."""
+"""Result tables: equal to reading every file, but faster; SQL, scores and pictures."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from plab.status import survey
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three finished runs that score 0.5, 0.75 and 0.25 and have not changed for a while."""
+    """Three finished runs with scores 0.5, 0.75 and 0.25 that have not changed for a while."""
     for seed, score in enumerate((0.5, 0.75, 0.25)):
         age(synthetic.save(synthetic.run(tmp_path / "results", seed=seed, score=score)))
     return tmp_path / "results"
 
 
 def age(path: Path, seconds: float = 60.0) -> None:
-    """Make a file look as if it was last changed so long ago."""
+    """Set a file's modification time to some time ago."""
     stat = path.stat()
     os.utime(path, (stat.st_atime - seconds, stat.st_mtime - seconds))
 
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the files that are opened."""
+    """Names of the files opened."""
     names: list[str] = []
     read = table.read_rows
 

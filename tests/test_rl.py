@@ -54,7 +54,7 @@ COARSE = (
 )
 
 OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")
-"""Updates begin in the second batch of episodes, and the buffer remembers the last four episodes."""
+"""Updates begin in the second batch of episodes, and the buffer holds the last four episodes."""
 
 METHODS = {
     "sac": OFF_POLICY,
@@ -69,10 +69,10 @@ OWN = [name for name in METHODS if name != "tqc"]
 """Methods that have populations."""
 
 RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3"))
-"""A population: different in seed, material and scene."""
+"""A population whose runs differ in seed, material and scene."""
 
 STEPS = {"tqc": (sb3.Sb3Runner, "_watch")}
-"""Step of training outside populations."""
+"""Training steps outside populations."""
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])
 
@@ -104,12 +104,12 @@ def statuses(cfgs: list[Config]) -> list[str]:
 
 
 def partial(cfg: Config) -> RunResult:
-    """An unfinished run's file."""
+    """File of an unfinished run."""
     return read(cfg.path.with_suffix(".partial.h5"))
 
 
 def assert_same_run(cfg: Config, want: RunResult) -> RunResult:
-    """Assert that a run's file and policy agree with another one's in all but times; return it."""
+    """Assert that a run's file and policy equal another run's except for times; return it."""
     got = finished_as(cfg, want)
     # The same arrays in the same bytes.
     assert policy_path(got.path).read_bytes() == policy_path(want.path).read_bytes()
@@ -117,13 +117,13 @@ def assert_same_run(cfg: Config, want: RunResult) -> RunResult:
 
 
 def assert_nothing_else_is_left(*results: RunResult) -> None:
-    """Assert that only results, policies and logs are in the runs' folders."""
+    """Assert that the folders contain only results, policies and logs."""
     names = {path.name for one in results for path in one.path.parent.iterdir() if path.is_file()}
     assert names == {path.name for one in results for path in (one.path, policy_path(one.path))}
 
 
 def batches_of(*cfgs: Config) -> list[EpisodeBatch]:
-    """Environments of a training, two for each run, and of the evaluation."""
+    """Training environments, two per run, and evaluation environments."""
     own = [cfg for cfg in cfgs for _ in range(2)]
     return shared_batches(CACHE, (own, cfgs[0].method.contact), (cfgs, "hard"))
 
@@ -278,7 +278,7 @@ def test_runs_that_stand_at_different_evaluations_go_on_to_the_same_numbers(tmp_
 
 
 def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -> None:
-    """Lost steps are computed again, to the same numbers; a replay buffer may be ahead of the state."""
+    """Lost steps are recomputed with the same numbers; a replay buffer may be ahead of the state."""
     cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, "td3")]
     with monkeypatch.context() as patch, stopped_at(27, RlRunner, "_step"):
         # As if the process were killed.
@@ -291,7 +291,7 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -
 
 
 def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
-    """Needed to go on with the training, not before the final evaluation."""
+    """The buffer is required to continue training, but not before the final evaluation."""
     cfg = make_config(tmp_path, "tqc")
     lost = cfg.path.with_suffix(".replay")
     with stopped_at(20, *STEPS["tqc"]):
@@ -324,7 +324,7 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
 
 
 def break_evaluation(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    """Let an evaluation of the first run break off in its third step."""
+    """Make an evaluation of the first run diverge in its third step."""
     intact, calls = training.evaluate, itertools.count()
 
     def evaluated(env: TensorEnv, decide: Any) -> Any:
@@ -355,7 +355,7 @@ def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, lone, m
 
 
 def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None:
-    """Have both environments of a population's second run break off in some steps of the training."""
+    """Make both environments of a population's second run diverge in some training steps."""
     intact, calls = RlRunner._step, itertools.count()
 
     def step(self: RlRunner) -> None:
@@ -369,7 +369,7 @@ def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None
 
 @pytest.mark.parametrize("method", ["sac", "ppo"])
 def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method, monkeypatch, caplog) -> None:
-    """They are counted and end nothing: episodes of the second run, and an evaluation of the first run."""
+    """Divergence in episodes of the second run and in an evaluation of the first is only counted."""
     cfgs, alone = configs(tmp_path, method), lone[method]
     break_steps(monkeypatch, {9})
     break_evaluation(monkeypatch, 1)
@@ -387,7 +387,7 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
 
 
 def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
-    """All episodes of the second run break off, and the networks of the third run are not finite."""
+    """All episodes of the second run diverge, and the third run's networks become non-finite."""
     cfgs = configs(tmp_path, "sac")
     intact = RlRunner.train
 
@@ -412,7 +412,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
 
 
 def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
-    """Until they fit ``sim.memory_mb``; one is always tried."""
+    """Halve until the buffers fit ``sim.memory_mb``; a single buffer is always tried."""
     cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
     assert statuses(cfgs) == ["finished"] * 2
     assert {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
@@ -447,7 +447,7 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
 
 @pytest.mark.nightly
 def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
-    """On Torus, coarse: after 200 episodes better than any of 32 random ones, with noise and without."""
+    """After 200 episodes on a coarse Torus, it beats 32 random episodes, with and without noise."""
     fast = ("sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10", "sim.particles_scale=0.2")
     training = ("method.num_envs=10", "method.episodes=200", "method.steps_per_update=500")
     updates = ("method.minibatches=8", "method.lr_decay=false", "method.evaluate_every=20")

@@ -1,4 +1,4 @@
-"""Start of Taichi, and changes to it."""
+"""Start of Taichi, and patches of it."""
 
 import gc
 import os
@@ -37,7 +37,7 @@ def test_a_killed_process_leaves_no_lock_on_compiled_kernels(tmp_path, monkeypat
 
 
 def test_taichi_prints_nothing_and_does_not_tell_its_makers() -> None:
-    """It would print a banner, and ask for newer versions of itself, in a thread."""
+    """Taichi would print a banner, and check for newer versions in a thread."""
     script = """
 import plab.bench.speed, plab.losses.density
 import sys, threading
@@ -54,7 +54,7 @@ runtime.start_runtime("cpu", "float32")
 
 @pytest.mark.skipif(QUADRANTS, reason="of Taichi")
 def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
-    """Their addresses may belong to another array in use by then."""
+    """The same address may belong to a newer array."""
     start_runtime("cpu", "float32")
     former = ti.ndarray(ti.f32, 3)
     start_runtime("cpu", "float64")

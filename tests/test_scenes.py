@@ -1,4 +1,4 @@
-"""Scenes as data: volumes, advice on time steps, entries of observations, shapes of manipulators."""
+"""Scenes as data: volumes, time step limits, observation entries and manipulator shapes."""
 
 from __future__ import annotations
 

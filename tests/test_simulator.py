@@ -1,4 +1,4 @@
-"""The simulator beyond its physics: reproducibility, memory budget, refusals."""
+"""The simulator beyond its physics: reproducibility, memory budget and refusals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0, "soft": 0.5, "energy": 
 
 
 def ball(*, center: tuple[float, float, float] = (0.5, 0.4, 0.5), friction: float = 0.9) -> Scene:
-    """A ball of plasticine between two spheres on a coarse grid."""
+    """A plasticine ball between two spheres on a coarse grid."""
     tools = tuple(
         Manipulator("Sphere", (0.06,), (center[0] + dx, *center[1:]), scale=(0.02,) * 3, friction=friction)
         for dx in (-0.15, 0.15)
@@ -40,7 +40,7 @@ ACTIONS[:, :, 3] -= 0.6
 
 
 def targets(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mass and distance of the scenes' own volume, moved; all environments have the same."""
+    """Mass and distance of the scenes' volume, shifted; the same in all environments."""
     grid = np.stack(np.meshgrid(*[np.arange(16) / 16] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(grid - 0.6, axis=-1)
     mass = np.where(distance < 0.12, 3.0 * SCENES[0].particle_mass, 0.0)
@@ -55,7 +55,7 @@ def built(scenes: tuple[Scene, ...], device: str, **settings: float) -> Simulato
 
 
 def assert_same(got: np.ndarray, want: np.ndarray) -> None:
-    """Bit for bit on the CPU; on CUDA sums come in any order."""
+    """Compare bitwise on the CPU, and with a tolerance on CUDA, where the order of sums varies."""
     if DEVICE == "cpu":
         np.testing.assert_array_equal(got, want)
     else:
@@ -114,7 +114,7 @@ def test_actions_are_clipped(sim: Simulator) -> None:
 
 
 def test_other_scenes_in_the_same_simulator_are_as_if_built_anew(sim: Simulator) -> None:
-    """Also between environments: the state, the order of particles and the parameters all follow."""
+    """State, particle order and parameters follow the scenes, also between environments."""
     want = sim.rollout(ACTIONS)
     turned = [2, 0, 1]
     sim.set_scenes([SCENES[e] for e in turned])
@@ -219,7 +219,7 @@ def test_arguments_are_checked(sim: Simulator) -> None:
 
 
 def test_memory_is_checked(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Budget, numbers of an array, and of nodes."""
+    """Check the budget, and the numbers of array entries and nodes."""
     with monkeypatch.context() as patch:
         patch.setattr(sim, "memory_mb", 1e-3)
         with pytest.raises(MemoryError, match=r"sim.memory_mb=\d+"):
@@ -250,7 +250,7 @@ def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
 
 @pytest.mark.skipif(DEVICE != "cpu", reason="the layout of the CPU's fields")
 def test_fields_are_written_entry_by_entry(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In several pieces; numbers differ, so that no entry can be taken for another."""
+    """Write in several pieces; all numbers differ, so that none can be confused."""
     engine = sim._engine
     monkeypatch.setattr(storage, "PIECE", 7)
     for _, field, size in engine.shared:
@@ -265,7 +265,7 @@ def test_fields_are_written_entry_by_entry(sim: Simulator, monkeypatch: pytest.M
 
 @pytest.mark.skipif(DEVICE != "cpu", reason="test_deterministic.py is about CUDA")
 def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -> None:
-    """Bit for bit. The last test: a simulator of another number of threads ends those before."""
+    """Compare bitwise. The last test, because another number of threads invalidates existing simulators."""
     want, final = sim.rollout(ACTIONS), sim.state()
     # All 22 states were kept; with checkpoints fewer do.
     sim.memory_mb = (sim.memory_bytes() - 9 * sim._particles.slot_bytes) / 1e6
@@ -280,7 +280,7 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
 
 
 def test_impulses_are_the_momentum_that_bodies_lose(device: str) -> None:
-    """A ball that two boxes squeeze, and one that comes to rest on a box, in one batch."""
+    """A ball squeezed by two boxes, and a ball that comes to rest on a box, in one batch."""
     ball = (Body("sphere", (0.5, 0.5, 0.5), (0.1,), 300),)
 
     def scene(*tools: tuple[tuple[float, ...], tuple[float, ...]]) -> Scene:

@@ -1,4 +1,4 @@
-"""``plab status``: done, running, failed and missing runs."""
+"""``plab status``: finished, running, failed and missing runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from plab.status.view import watch
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:
-    """Write the file of a run that has done some of its 4 iterations, or 100 episodes."""
+    """Write the file of a run that has completed some of its 4 iterations, or 100 episodes."""
     result = synthetic.run(folder, **which)
     changes = {"evaluation": {}, "message": message}
     return synthetic.save(dataclasses.replace(synthetic.cut(result, rows), status=status, **changes))

@@ -1,4 +1,4 @@
-"""Submissions: files, cards, configurations, command lines and the numbers of the leaderboard."""
+"""Submissions: files, cards, configurations, command lines, and leaderboard numbers."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def entry(variant: str = "1", steps: int = 100, score: float = 0.5, **which: Any
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A submission of two plans."""
+    """A submission with two plans."""
     made = tmp_path / "mine.plabsub.zip"
     write(Submission(CARD, (entry(), entry("2", steps=5000))), made)
     return made
 
 
 def changed(path: Path, **members: bytes) -> Path:
-    """Replace members of a file, named with ``_`` for every other sign."""
+    """Replace members of a file; member names are given with ``_`` for special characters."""
     kept = read_members(path)
     names = {re.sub(r"\W", "_", name): name for name in kept}
     kept |= {names[key]: content for key, content in members.items()}
@@ -90,7 +90,7 @@ def with_manifest(path: Path, values: dict[str, Any], entry: int | None = None) 
 
 
 def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the one-line message of the error that a call raises."""
+    """Return the message of the error that a call raises."""
     with pytest.raises(ResultsError) as caught:
         function(*args, **options)
     assert "\n" not in str(caught.value)
@@ -301,7 +301,7 @@ def judged(path: Path, scores: list[float], outcome: str = HOLDS) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Plans that hold, a policy that was not run, a lie, a recording, a foreign scene, damaged files."""
+    """Valid plans, a policy that was not run, a false claim, a recording, damaged files."""
     folder = tmp_path_factory.mktemp("submissions")
     plans = (real("1", 900, 0.2), real("1", 10_000, 0.8), real("2", 9000, 0.4))
     judged(handed_in(folder, "plans", plans, gradient=True, description="<b>bold</b>"), [0.2, 0.8, 0.4])

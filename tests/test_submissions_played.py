@@ -1,4 +1,4 @@
-"""Submissions recorded from an agent, simulated again and verified; policies of both formats."""
+"""Submissions recorded from an agent, simulated again and verified; policies in both formats."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def make(variant: str = "1", **keywords: Any) -> gymnasium.Env:
 
 
 def episode(env: gymnasium.Env, actions: np.ndarray) -> float:
-    """Play some actions; return the score of the last."""
+    """Simulate some actions; return the final score."""
     env.reset(seed=0)
     return [env.step(action.astype(np.float32))[4]["score"] for action in actions][-1]
 
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[gymnasium.Env]:
-    """An environment of variant 1, to be recorded into several folders."""
+    """Environment of variant 1, recorded into several folders."""
     made = make(disable_env_checker=True)
     yield made
     made.close()
@@ -67,7 +67,7 @@ def submission(tmp_path: Path, *argv: str) -> Path:
 
 
 def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the one-line message of the SubmissionError that a call raises."""
+    """Return the message of the SubmissionError that a call raises."""
     with pytest.raises(SubmissionError) as caught:
         function(*args, **options)
     assert "\n" not in str(caught.value)
@@ -135,7 +135,7 @@ def test_what_cannot_be_recorded(tmp_path: Path, env: gymnasium.Env, monkeypatch
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory, env: gymnasium.Env) -> Path:
-    """A submission of two configurations, recorded and packed."""
+    """A submission with two configurations, recorded and packed."""
     folder = tmp_path_factory.mktemp("packed")
     for one, plan in zip((env, make("2")), PLANS, strict=False):
         episode(record(one, folder / "recordings"), plan)
@@ -180,7 +180,7 @@ def test_claims_are_simulated_again(
 
 
 class Acting(torch.nn.Module):
-    """Goes down, and a little to where its weights say."""
+    """Policy that moves down, and slightly towards its weights."""
 
     def __init__(self, entries: int, components: int = 3) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The ten tasks: Chopsticks always, all fifty configurations at full size nightly."""
+"""The ten tasks: Chopsticks in every run, all fifty configurations at full size nightly."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ MOMENTS = Path(__file__).parent / "target_moments.csv"
 
 
 def problem(task: str, variants: tuple[str, ...], *overrides: str) -> tuple[Problem, np.ndarray]:
-    """A batch of a task's variants and their demonstrations, shape [batch, T, A]."""
+    """Batch of a task's variants, and their demonstrations, shape [batch, T, A]."""
     gc.collect()
     cfgs = [load_config([f"task={task}", f"variant={k}", *overrides]) for k in variants]
     return Problem(cfgs), np.stack([known_actions(cfg) for cfg in cfgs])
 
 
 def check_steps(task: Problem, actions: np.ndarray) -> None:
-    """Go a few steps forward and backward in both contact models."""
+    """Simulate a few steps forward and backward in both contact models."""
     scene: Scene = task.scenes[0]
     total = scene.particle_count * scene.particle_mass
     for contact in ("soft", "hard"):
@@ -47,7 +47,7 @@ def check_steps(task: Problem, actions: np.ndarray) -> None:
 
 
 def test_chopsticks_step_score_and_differentiate(device):
-    """The manipulator with most degrees of freedom, at a tenth of the particles."""
+    """Test the manipulator with most degrees of freedom, with a tenth of the particles."""
     batch, actions = problem("Chopsticks", ("1", "4"), "sim.particles_scale=0.1", f"sim.device={device}")
     check_steps(batch, actions[:, :3])
 
@@ -65,9 +65,9 @@ def test_all_configurations_step_score_and_differentiate(task, device):
 @pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_targets_are_those_that_were_published(task, device):
-    """Against ``tests/target_moments.csv``, made by ``python -m plab.targets --csv``.
+    """Compare with ``tests/target_moments.csv``, written by ``python -m plab.targets --csv``.
 
-    The tolerance is what float32 and float64, CPU and CUDA differ by, with a margin.
+    The tolerance covers the differences between float32 and float64, CPU and CUDA, with a margin.
     """
     table = moments(task, [f"sim.device={device}"], rebuild=True)
     expected = pd.read_csv(MOMENTS, dtype={"variant": str}).query("task == @task")
@@ -80,7 +80,7 @@ def test_targets_are_those_that_were_published(task, device):
 
 
 def test_thin_manipulators_are_warned_of(caplog) -> None:
-    """Those that fit between two nodes, by number and thickness."""
+    """The warning gives number and thickness of manipulators that fit between two nodes."""
     for radius, lines in ((0.01, 1), (0.02, 0)):
         caplog.clear()
         Problem([load_config(["task=Pinch", *COARSE, f"task.manipulators.ball.size=[{radius}]"])])

@@ -1,4 +1,4 @@
-"""Sweeps with the toy runner: choice of runs, batches, failures, several processes, composition of jobs."""
+"""Sweeps with the toy runner: selection of runs, batches, failures, processes, composition of jobs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _toy_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def sweep(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[str, int], list[str]]]:
-    """Run a sweep; returns exit code, runs by status, lines on standard error."""
+    """Run a sweep; return exit code, runs by status, and lines on standard error."""
 
     def call(*argv: str) -> tuple[int, dict[str, int], list[str]]:
         capsys.readouterr()
@@ -224,7 +224,7 @@ def test_full_size_batches_fit_the_memory(device: str) -> None:
 
 
 HERE = "_target_:hydra._internal.core_plugins.basic_launcher.BasicLauncher"
-"""Hydra's own launcher, whose jobs are of this process, as another launcher."""
+"""Hydra's basic launcher under another name; its jobs run in this process."""
 
 
 def test_another_launcher_gets_a_job_per_batch(sweep, monkeypatch) -> None:

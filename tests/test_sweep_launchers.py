@@ -1,4 +1,4 @@
-"""Sweeps on several GPUs and through Hydra's launchers: choice of batches, progress, killed processes."""
+"""Sweeps on several GPUs and with Hydra's launchers: batching, progress and killed processes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from toy_runner import COARSE, assert_complete, configs
 
 @pytest.fixture
 def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Let threads with the toy runner take the place of the GPUs' processes, in an empty folder.
+    """Replace the GPU processes by threads with the toy runner, in an empty folder.
 
     Returns:
-        Names of the GPUs of the processes that are killed by their next batch; empty at first.
+        GPUs whose processes are killed by their next batch; initially empty.
     """
     monkeypatch.chdir(tmp_path)
     toy_runner.install(monkeypatch)

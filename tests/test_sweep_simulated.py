@@ -1,4 +1,4 @@
-"""Sweeps of tiny simulated runs: a batch gives each run what it gives alone, whatever ends the others."""
+"""Sweeps of tiny simulated runs: batched runs equal single runs, even if other runs fail."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, alone, capsy
 
 
 def test_a_run_that_breaks_off_does_not_disturb_the_others(tmp_path: Path, alone) -> None:
-    """NaN inside the simulator, in environment 1 from the third iteration on."""
+    """Insert NaN inside the simulator, in environment 1 from the third iteration on."""
     cfgs = configs(tmp_path)
     intact, calls, whole = Problem.rollout, iter(range(100)), []
 

@@ -1,4 +1,4 @@
-"""Targets: recipes, simulated ones and their cache, files of the original release, refusals."""
+"""Targets: recipes, simulated targets and their cache, files of the original release, refusals."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_refused_targets(rope):
 
 
 class Recorder:
-    """Stands for a simulator in the cache's key."""
+    """Stand-in for a simulator in the cache key."""
 
     precision, device = "float32", "cpu"
 
@@ -204,14 +204,14 @@ def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, 
 
 
 def few(mass: np.ndarray, value: float) -> np.ndarray:
-    """A copy with another mass at three nodes."""
+    """Copy with a different mass at three nodes."""
     changed = mass.copy()
     changed[30:33, 1, 30] = value
     return changed
 
 
 def test_release_files_are_loaded_as_they_are(tmp_path, released):
-    """Also with small negative masses; targets of Pinch hold more mass than its scene."""
+    """Include small negative masses; targets of Pinch have more mass than their scene."""
     scene, mass = released
     fewer = replace(scene, name="Pinch", bodies=(replace(scene.bodies[0], particles=6000),))
     for name, one, values in (

@@ -1,4 +1,4 @@
-"""Methods that descend by the gradient on a coarse scene: rules, whole runs, resumption, logs."""
+"""Gradient descent methods on a coarse scene: rules, whole runs, resumption and logs."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run(cfg: Config) -> RunResult:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """An uninterrupted run."""
+    """Uninterrupted run."""
     return run(make_config(tmp_path_factory.mktemp("results")))
 
 
@@ -91,7 +91,7 @@ def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
 
 @pytest.mark.parametrize("optimizer", ["adam", "gd"])
 def test_rules_are_adam_and_momentum(method, optimizer: str) -> None:
-    """Adam as published; v <- m v + (1 - m) g from v = 0, actions <- actions - lr v."""
+    """Check Adam as published; v <- m v + (1 - m) g from v = 0, actions <- actions - lr v."""
     settings = replace(method, optimizer=optimizer, lr=0.1, momentum=0.8, betas=[0.9, 0.99], eps=1e-6)
     actions, rng = rule(settings, 5, 4), np.random.default_rng(0)
     expected, m, s, v = actions.actions, *np.zeros((3, 5, 4))
@@ -214,7 +214,7 @@ def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
 
 
 def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: BaseException) -> None:
-    """Raise an error instead of a rollout, counted from 0."""
+    """Raise an error at a rollout, counted from 0."""
     intact, calls = where.rollout, iter(range(1_000))
 
     def rollout(self, actions, **options):
@@ -334,7 +334,7 @@ APG = ("method=apg", "method.hidden=[16,16]", "method.lr=0.01")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """An uninterrupted run of apg."""
+    """Uninterrupted run of apg."""
     return run(make_config(tmp_path_factory.mktemp("apg"), *APG))
 
 

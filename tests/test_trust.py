@@ -1,4 +1,4 @@
-"""Files of strangers: nothing is unpickled or imported, no path leaves its folder, sizes are bounded."""
+"""Untrusted files: nothing is unpickled or imported, no path leaves its folder, sizes are limited."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RUN = "Rope-v1/adam/seed0.h5"
 
 
 class Marker:
-    """Makes a folder where it is unpickled."""
+    """Object that creates a folder when unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -43,7 +43,7 @@ class Marker:
 
 
 def saved(folder: Path, **changes: Any) -> Path:
-    """Write a finished run, with changes of its attributes, and return its file."""
+    """Write a finished run with changed attributes, and return its file."""
     path = synthetic.save(synthetic.run(folder))
     with h5py.File(path, "r+") as file:
         file.attrs.update(changes)
@@ -67,7 +67,7 @@ def target_scene() -> Scene:
 
 
 def make_target(folder: Path) -> Path:
-    """Write a target file as the release has them."""
+    """Write a target file in the release's format."""
     scene = target_scene()
     mass = np.zeros((16, 16, 16))
     mass[4:8, 1:3, 4:8] = scene.particle_count * scene.particle_mass / 32
@@ -77,7 +77,7 @@ def make_target(folder: Path) -> Path:
 
 
 def make_policy(folder: Path) -> Path:
-    """Write an untrained policy beside a result."""
+    """Write an untrained policy next to a result."""
     method = load_config(["task=Move", "method=ppo", "method.hidden=[4]"]).method
     bounds = np.arange(5, dtype=np.float32)
     spaces = Spaces(Box(-bounds, bounds), Box(-1.0, 1.0, (3,), np.float32))
@@ -88,7 +88,7 @@ def make_policy(folder: Path) -> Path:
 
 
 def said(reading: Callable[[], Any]) -> str:
-    """Return what a refusal says."""
+    """Return the message of a refusal."""
     with pytest.raises((ResultsError, TargetError)) as caught:
         reading()
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Tutorials: their Python code is run once, their excerpts and changes are the source's."""
+"""Tutorials: their Python code runs, and their excerpts and diffs match the source."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Compose coarse configurations on the CPU; keep simulators from one page to the next."""
+    """Compose coarse configurations on the CPU; keep simulators between pages."""
 
     def coarse(overrides: Sequence[str] = (), config_dir: str | None = None) -> Config:
         words = [word for word in overrides if word != "sim.device=cuda"]
@@ -96,7 +96,7 @@ def test_quick_start_and_readme(page, changes):
 @pytest.mark.nightly
 @pytest.mark.usefixtures("small")
 def test_paper():
-    """Each experiment, with a few steps of training."""
+    """Run each experiment with a few training steps."""
     fewer = [(f"range({many})", f"range({few})") for many, few in ((20, 2), (1000, 9), (50, 2))]
     fewer += [("16, ", "4, "), ("100_000", "200"), ("50_000", "110"), ('"scenes": 8', '"scenes": 2')]
     plan = '"method.window=50", "method.execute=50", "method.planner.iterations=1"'
@@ -109,7 +109,7 @@ def test_paper():
 
 @pytest.mark.usefixtures("small")
 def test_environments():
-    """With one update of the agent."""
+    """Run the page with one update of the agent."""
     names = run_page("environments.md", *FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200"))
     assert names["info"]["score"] >= 0.0
     assert names["infos"]["score"].shape == (4,)
@@ -144,7 +144,7 @@ def test_excerpts_are_from_the_methods(excerpt):
 
 
 def python(folder: Path, *words: str, path: Path = SRC) -> subprocess.CompletedProcess[str]:
-    """Run Python in a folder, with modules of a source tree."""
+    """Run Python in a folder with the modules of a source tree."""
     environment = os.environ | {"PYTHONPATH": str(path)}
     command = [sys.executable, *words]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -187,7 +187,7 @@ def test_an_interrupted_search_goes_on(tmp_path):
 
 
 def apply(page: str, root: Path) -> None:
-    """Make the changes of a page's diffs to a source tree."""
+    """Apply the diffs of a page to a source tree."""
     for block in blocks(page, "diff"):
         name, *lines = block.removeprefix("--- ").splitlines()
         old = "".join(f"{line[1:]}\n" for line in lines if line[0] in " -")
@@ -200,7 +200,7 @@ def apply(page: str, root: Path) -> None:
 
 @pytest.fixture
 def with_the_disc(tmp_path) -> Path:
-    """A copy of the source tree with the page's changes."""
+    """Copy of the source tree with the page's changes."""
     shutil.copytree(SRC, tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "conf", tmp_path / "conf")
     apply("developers/own_manipulator.md", tmp_path)

@@ -1,4 +1,4 @@
-"""3-D viewer: content of its page, command line, notebook frame, a real browser."""
+"""3-D viewer: page content, command line, notebook frame, and a real browser."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def recording() -> RecordedRollout:
-    """Everything rises by 0.02 a step; nothing is simulated."""
+    """Everything rises by 0.02 per step; nothing is simulated."""
     scene = build_scene(load_config(["task=Rope", *COARSE]))
     x = sample_particles(scene)
     poses = np.array([[*m.position, *m.rotation, m.gap] for m in scene.manipulators])
@@ -132,7 +132,7 @@ def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
 
 @pytest.fixture
 def simulated(monkeypatch, recording) -> list:
-    """Take the recording instead of simulating; return what was to be simulated."""
+    """Use a recording instead of a simulation; return the requested rollouts."""
     asked = []
 
     def stand_in(cfg, actions):
@@ -193,7 +193,7 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulat
 
 
 def seen(browser) -> tuple[bool, bool]:
-    """Return whether red plasticine is seen, and whether the blue target is."""
+    """Return whether red plasticine and the blue target are visible."""
     canvas = browser.find_element("id", "canvasTarget").screenshot_as_png
     picture = np.asarray(Image.open(io.BytesIO(canvas)).convert("RGB"), int)
     redness = picture[..., 0] - picture[..., 2]

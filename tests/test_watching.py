@@ -1,4 +1,4 @@
-"""Progress of a run on a terminal, its last lines, and rows that are kept at once."""
+"""Progress of a run on a terminal, its last lines, and immediately stored rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COARSE = ("sim.grid_size=16", "sim.horizon=2", "sim.substeps=5", "sim.dt=4e-4", 
 
 @pytest.fixture
 def screen(monkeypatch) -> io.StringIO:
-    """A terminal."""
+    """Fake terminal."""
     text = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda: Console(file=text, force_terminal=True, width=120))
     return text

@@ -1,4 +1,4 @@
-"""Gymnasium's conventions: autoreset, wrappers, ends of episodes, in vector environments and alone."""
+"""Gymnasium's conventions: autoreset, wrappers and ends of episodes, in single and vector environments."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
 
 
 def test_stages_ask_for_one_target_after_the_other() -> None:
-    """The first target is beside the ball: the second environment reaches it in a step."""
+    """The first target is next to the ball; the second environment reaches it in one step."""
     near = "{recipe: bodies, bodies: {ball: {shape: sphere, center: [0.68, 0.56, 0.75], size: [0.1]}}}"
     overrides = [*COARSE, "sim.horizon=4"]
     options = {"autoreset_mode": "Disabled", "success_score": 0.02, "observe": ["state", "target_mass"]}

@@ -1,6 +1,5 @@
-"""Runner without a simulation. Each loss follows from the state in the partial file, the first state from the
-configuration: a run that lost, repeated or mixed up an iteration ends with other numbers.
-"""
+"""Runner without simulation. Each loss follows from the state in the partial file, and the initial state from
+the configuration: a run that loses, repeats or confuses an iteration ends with different numbers."""
 
 from __future__ import annotations
 
@@ -26,11 +25,11 @@ COARSE_32 = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particl
 
 ITERATIONS = 12
 PAUSE = 0.0
-"""Time of an iteration of a batch [s]."""
+"""Duration of a batch iteration [s]."""
 
 FAILING_SEED = 13
 WHY = "iteration 3: environment step 1: the loss is not finite"
-"""Message of the runs with this seed, which break off in iteration 3."""
+"""Message of the runs with this seed, which fail in iteration 3."""
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,13 +58,13 @@ def expected(cfg: Config) -> list[float]:
 
 
 def computed() -> list[str]:
-    """Return the name of each result that a process has begun to compute, in order."""
+    """Return the names of the results that a process has started to compute, in order."""
     log = Path("results/log")
     return log.read_text().splitlines() if log.exists() else []
 
 
 def assert_complete(cfgs: Sequence[Config]) -> None:
-    """Assert that each result is there and right, and no other file."""
+    """Assert that each result exists and is correct, and that there are no other files."""
     for cfg in cfgs:
         result = read(cfg.path)
         assert result.status == "finished" and result.config_hash == cfg.hash
@@ -77,7 +76,7 @@ def assert_complete(cfgs: Sequence[Config]) -> None:
 
 
 def start(cfg: Config) -> np.ndarray:
-    """Return the state before the first iteration."""
+    """Return the initial state."""
     return np.frombuffer(hashlib.sha256(cfg.hash.encode()).digest(), np.uint32).astype(np.float64)
 
 
@@ -87,7 +86,7 @@ def advance(state: np.ndarray) -> np.ndarray:
 
 
 def run_toy(tracks: Sequence[Track]) -> None:
-    """Carry out a batch, and append the name of each result to ``log`` in the results folder."""
+    """Execute a batch, and append the name of each result to ``log`` in the results folder."""
     for track in tracks:
         with (Path(track.cfg.results_dir) / "log").open("a") as file:
             file.write(f"{track.cfg.path.name}\n")
@@ -114,7 +113,7 @@ def run_toy(tracks: Sequence[Track]) -> None:
 
 
 class ToyRunner(Runner):
-    """Runner of a family; tests may replace :func:`run_toy`."""
+    """Runner of all families; tests may replace :func:`run_toy`."""
 
     def run(self) -> None:
         run_toy(self.tracks)

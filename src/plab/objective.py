@@ -220,8 +220,7 @@ def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
 
 
 def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
-    """Score an episode by the mass tensors of its first and last states and of the target, shape [n, n, n]
-    each."""
+    """Score an episode by the mass tensors of its initial and final states and target, [n, n, n] each."""
     return scores_from_iou(soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target))
 
 

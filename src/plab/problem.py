@@ -100,8 +100,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Return True if a scene and its target fit into the domain of the grid, which is smaller for coarse
-    grids."""
+    """Return True if a scene and its target fit into the grid's domain, smaller for coarse grids."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):
@@ -278,8 +277,7 @@ class Problem:
         return total_loss(terms, self._held_weights.like(terms))
 
     def scores_of(self, iou: Any) -> tuple[Any, Any]:
-        """Return ``score`` and ``score_printed`` of states, given their soft IoUs; arrays or tensors of shape
-        [batch]."""
+        """Return ``score`` and ``score_printed``, shape [batch], given soft IoUs; arrays or tensors."""
         return batch_scores(self._scale.like(iou), iou)
 
     def totals(self, terms: Any, loss: Any, first_loss: Any, iou: Any) -> dict[str, float]:

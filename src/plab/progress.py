@@ -68,8 +68,7 @@ def show_progress(
 
 
 def show_line(text: str) -> None:
-    """Show the current measurement on a terminal, in a line of standard error that the next one
-    overwrites."""
+    """Show the current measurement on a terminal, in a line that the next one overwrites."""
     if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

@@ -1,4 +1,4 @@
-"""No access beyond the end of a grid, by Taichi's own checks, wherever particles are."""
+"""No out-of-bounds access to grids, by Taichi's own checks, for any particle positions."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ print("within bounds")
 
 @pytest.mark.nightly
 def test_no_access_is_out_of_bounds() -> None:
-    """Particles in corners, thrown about, all at one point; v and F that are not finite."""
+    """Particles in corners, at high speed, all at one point; v and F non-finite."""
     environment = os.environ | {"TI_DEBUG": "1", "TI_OFFLINE_CACHE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""Bodies without manipulators against closed forms: motion, material law, floor, vibration, stability.
+"""Bodies without manipulators against closed forms: motion, material law, floor, vibration and stability.
 
 One compiled simulator serves most tests. Its bodies are lattices of 8^3 particles, eight per cell as in the
 suite. Environments differ in material, gravity and floor; an environment step is one substep.
@@ -25,7 +25,7 @@ WIDTH = EDGE / (2 * GRID)
 CENTER = np.array([0.5, 0.5, 0.5])
 FLOOR_FRICTION = 0.4
 NORM_SHIFT = 1e-8
-"""Shift under the root of the deviator's norm, see docs/physics.md."""
+"""Shift under the square root of the deviator's norm, see docs/physics.md."""
 
 MATERIALS = {
     "elastic": {"yield_stress": np.inf},
@@ -38,24 +38,24 @@ MATERIALS = {
 
 BAR_LENGTH = 0.5
 BAR_COUNTS = (4, EDGE)
-"""Particles across the bar: its vibration is one-dimensional, its section need not be resolved."""
+"""Particles across the bar, few because its vibration is one-dimensional."""
 
 
 def lattice(center: np.ndarray, counts: tuple[int, int, int], grid: int) -> np.ndarray:
-    """Particles two per cell and axis around a point, shape [particle, 3]."""
+    """Lattice with two particles per cell and axis around a point, shape [particle, 3]."""
     index = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 3)
     return center + (index - 0.5 * (np.array(counts) - 1)) / (2 * grid)
 
 
 def block(center: np.ndarray = CENTER, **changes: object) -> Scene:
-    """One block; ``changes`` are fields of the scene."""
+    """Scene with one block; ``changes`` are fields of the scene."""
     body = Body("box", tuple(center), (WIDTH,) * 3, EDGE**3)
     values = {"gravity": (0.0, 0.0, 0.0), "grid_size": GRID, "dt": DT, "substeps": 1, **changes}
     return Scene("free", (body,), (), **values)
 
 
 def bar(grid: int) -> tuple[Scene, np.ndarray]:
-    """A bar along x with Poisson ratio 0, and its particles; grid and time step are refined together."""
+    """Bar along x with Poisson ratio 0, and its particles; grid and time step are refined together."""
     counts = (round(2 * grid * BAR_LENGTH), *BAR_COUNTS)
     body = Body("box", tuple(CENTER), tuple(c / (2 * grid) for c in counts), math.prod(counts))
     young = (0.5 / GRID / DT) ** 2
@@ -67,7 +67,7 @@ def bar(grid: int) -> tuple[Scene, np.ndarray]:
 
 
 def scenes() -> dict[str, Scene]:
-    """All environments by name."""
+    """Scenes of all environments by name."""
     out = {name: block(**material) for name, material in MATERIALS.items()}
     out["falling"] = block(gravity=(3.0, -30.0, 7.0))
     on_floor = np.array([0.5, 0.5 * WIDTH, 0.5])
@@ -104,7 +104,7 @@ def free() -> Simulator:
 
 
 def at_rest() -> dict[str, np.ndarray]:
-    """Fields of the initial state, to be changed and handed to :func:`put`."""
+    """Fields of the initial state, to be changed and passed to :func:`put`."""
     shape = START.shape
     identity = np.broadcast_to(np.eye(3), (*shape, 3)).copy()
     return {"x": START.copy(), "v": np.zeros(shape), "C": np.zeros((*shape, 3)), "F": identity}
@@ -139,7 +139,7 @@ def angular_momentum(state: State) -> np.ndarray:
 
 
 def test_free_fall_is_that_of_symplectic_euler(free: Simulator) -> None:
-    """x_k = x_0 + v_0 t + g t (t + dt) / 2."""
+    """Compare with x_k = x_0 + v_0 t + g t (t + dt) / 2."""
     e, steps = NAMES.index("falling"), 100
     fields = at_rest()
     fields["v"] += (0.5, 1.0, -0.5)
@@ -156,7 +156,7 @@ def test_free_fall_is_that_of_symplectic_euler(free: Simulator) -> None:
 def test_mass_and_momenta_of_free_bodies_are_conserved(
     free: Simulator, strain: float, tolerance: float
 ) -> None:
-    """To rounding, while the body spins, vibrates and yields.
+    """Conserved to rounding, while the body spins, vibrates and yields.
 
     A body that is torn apart (strain 0.3) has nodes lighter than 1e-12, a billionth of a particle; they are
     skipped, and their momentum is lost.
@@ -179,7 +179,7 @@ def test_mass_and_momenta_of_free_bodies_are_conserved(
 
 
 def test_steady_shear_is_exact(free: Simulator) -> None:
-    """Patch test: without forces v = A x with A^2 = 0 is steady, x = (I + t A) x_0 and F = I + t A."""
+    """Patch test: without forces, v = A x with A^2 = 0 is steady, x = (I + t A) x_0 and F = I + t A."""
     e, steps = NAMES.index("dust"), 100
     shear = np.zeros((3, 3))
     shear[0, 1] = 10.0
@@ -199,13 +199,13 @@ def test_steady_shear_is_exact(free: Simulator) -> None:
 
 
 def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mapping and stress of given deformations, computed by the simulator's own substep.
+    """Return mapping and stress of given deformations, computed by the simulator's substep.
 
     On CUDA stress stays in registers in the forward pass; the backward pass computes it again and keeps it.
 
     Args:
         sim: The simulator.
-        trial: Trial deformation gradients, the same in every environment, shape [particle, 3, 3].
+        trial: Trial deformation gradients, equal in all environments, shape [particle, 3, 3].
 
     Returns:
         New deformation gradients and Kirchhoff stresses, both [batch, particle, 3, 3].
@@ -231,10 +231,11 @@ def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def principal_law(scene: Scene, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Closed form in principal stretches: von Mises in Hencky strain, then fixed-corotated stress.
+    """Closed form in principal stretches: von Mises return mapping in Hencky strain, then fixed-corotated
+    stress.
 
     Args:
-        scene: Its material.
+        scene: Scene whose material is used.
         stretch: Principal trial stretches, shape [..., 3].
 
     Returns:
@@ -259,7 +260,7 @@ def rotations(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [0.0, 1e-8, 1e-3, 0.1, 0.5])
 def test_the_law_is_isotropic_and_objective_in_any_principal_directions(free: Simulator, size: float) -> None:
-    """F = U diag(s) V^T flows to U diag(s') V^T with stress U diag(t) U^T; rotations make none."""
+    """F = U diag(s) V^T maps to U diag(s') V^T with stress U diag(t) U^T; rotations cause no stress."""
     stretch = np.exp(np.random.default_rng(1).normal(scale=size, size=(COUNT, 3)).clip(-2.0, 2.0))
     u, v = rotations(2), rotations(3)
     trial = u * stretch[:, None] @ v.transpose(0, 2, 1)
@@ -278,10 +279,10 @@ def test_the_law_is_isotropic_and_objective_in_any_principal_directions(free: Si
 
 
 def test_cyclic_stretch_draws_the_elastoplastic_loop(free: Simulator) -> None:
-    """Isochoric stretching to and fro, step by step: Prandtl's rule in Hencky strain.
+    """Isochoric stretching back and forth follows Prandtl's rule in Hencky strain.
 
     Each step multiplies F by exp(D) with D = +-s diag(1, -1/2, -1/2), so that log V = a diag(1, -1/2, -1/2)
-    with a scalar a that moves by s and is held by the yield surface.
+    with a scalar a that moves by s and is limited by the yield surface.
     """
     e, scene = NAMES.index("plastic"), SCENES["plastic"]
     limit, s = scene.yield_stress / (2.0 * scene.material.shear_modulus), 2e-3
@@ -305,7 +306,7 @@ def test_cyclic_stretch_draws_the_elastoplastic_loop(free: Simulator) -> None:
 
 
 def test_a_sliding_block_loses_friction_times_the_normal_impulse(free: Simulator) -> None:
-    """On a slippery floor it goes on, on a sticky one it stops."""
+    """It continues on a slippery floor, and stops on a sticky one."""
     fields = at_rest()
     fields["v"][..., 0] += 3.0
     put(free, fields)
@@ -337,7 +338,7 @@ def test_blocks_thrown_at_walls_stay_inside_and_elastic_ones_come_back(
 
 
 def frequency_error(sim: Simulator, e: int) -> float:
-    """Relative error of the first mode's frequency, from where its velocity passes zero over two periods."""
+    """Relative error of the first mode's frequency, from zero crossings of its velocity."""
     scene, start = sim.scenes[e], sim.state()
     k, speed = math.pi / BAR_LENGTH, 1e-3  # strains of 1e-5: linear
     phase = k * (start.x[e, :, 0] - 0.5 + 0.5 * BAR_LENGTH)
@@ -356,7 +357,7 @@ def frequency_error(sim: Simulator, e: int) -> float:
 
 
 def test_the_frequency_of_an_elastic_bar_converges_at_second_order(free: Simulator) -> None:
-    """To sqrt(E / rho) / 2 L, that of the rod equation for longitudinal vibration with free ends."""
+    """The limit is sqrt(E / rho) / 2 L, from the rod equation for longitudinal vibration with free ends."""
     free.reset()
     coarse = frequency_error(free, NAMES.index("bar"))
     scene, x = bar(32)
@@ -366,7 +367,7 @@ def test_the_frequency_of_an_elastic_bar_converges_at_second_order(free: Simulat
 
 
 def test_a_lone_particle_is_stable_only_below_the_limit_of_the_time_step() -> None:
-    """Time steps at a ratio of dx sqrt((1 - 2 nu) / E), wherever the particle is in its cell."""
+    """Time steps are multiples of dx sqrt((1 - 2 nu) / E), for any position of the particle in its cell."""
     places = ((0.5, 0.5, 0.5), (0.51, 0.49, 0.53), (0.47, 0.52, 0.505))
     cases = list(itertools.product((0.99, 1.01), (0.0, 0.2, 0.45), places))
     scenes = []

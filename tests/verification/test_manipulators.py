@@ -1,8 +1,8 @@
-"""A block of plasticine and all seven manipulators: states against the plain reference, gradients against
-autograd and central differences, contact.
+"""A plasticine block and all seven manipulators: states against the reference, gradients against autograd and
+central differences, contact.
 
-One simulator, compiled once, serves all tests. Which manipulator touches the block is a matter of the poses,
-hence of the state.
+All tests share one compiled simulator, because the poses, which are part of the state, determine which
+manipulator touches the block.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ALPHA = {"soft": 666.0, "hard": 0.0}
 GRIDS = (BATCH, *[SCENE.grid_size] * 3)
 
 TOUCHING = {kind: (kind,) for kind in KINDS if kind != "Cylinder"} | {"Cylinder": ("Cylinder", "Sphere")}
-"""Cases: a manipulator at the block; the static one together with one that moves."""
+"""Cases: one manipulator at the block; the static one together with a moving one."""
 
 X = sample_particles(SCENE)
 X_MAX = 1.0 - 3.0 * SCENE.dx
@@ -51,7 +51,7 @@ def simulator() -> Simulator:
 
 @pytest.fixture
 def touched(simulator: Simulator) -> Simulator:
-    """The simulator with soft contact and an empty target: |mass - target| has no kink then."""
+    """Simulator with soft contact and an empty target, so that |mass - target| has no kink."""
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n for n in GRIDS[1:]], indexing="ij"), axis=-1)
     distance = np.linalg.norm(nodes - (0.6, 0.35, 0.42), axis=-1)
     simulator.set_target(np.zeros(GRIDS), np.broadcast_to(distance, GRIDS))
@@ -75,9 +75,10 @@ def test_states_from_rest_agree_with_the_reference(simulator: Simulator) -> None
 
 @pytest.mark.parametrize("turn", [0, 1])
 def test_rollouts_and_their_gradients_agree_with_the_reference(simulator: Simulator, turn: int) -> None:
-    """From moving, strained starts; strains of 0.02 are the material's series, of 0.15 its singular values.
+    """Moving, strained initial states; strains of 0.02 use the material's series, strains of 0.15 singular
+    values.
 
-    Environments differ in strain and contact model, and exchange both between the two turns.
+    Environments differ in strain and contact model, and swap both between the two rounds.
     """
     contacts = [("soft", "hard")[(e // 2 + turn) % 2] for e in range(BATCH)]
     strains = np.array([(0.02, 0.15)[(e + turn) % 2] for e in range(BATCH)])[:, None, None, None]
@@ -114,10 +115,10 @@ def test_rollouts_and_their_gradients_agree_with_the_reference(simulator: Simula
 # ------------------------------------------------------------------------------------- central differences
 
 SIZES = 10.0 ** -np.arange(3.0, 5.6, 0.5)
-"""Half widths: the error falls as h^2 to that of rounding, which grows as 1 / h."""
+"""Half widths: the truncation error decreases as h^2, the rounding error increases as 1 / h."""
 
 BOTTOM = 1e-6 if DEVICE == "cpu" else 2e-6
-"""Largest relative error of the best width; on CUDA losses differ by rounding from run to run."""
+"""Largest relative error at the best width; on CUDA losses differ by rounding between runs."""
 
 
 class Point(NamedTuple):
@@ -137,15 +138,15 @@ class Point(NamedTuple):
 
 
 Way = Callable[[float], Point]
-"""The point at a distance along some direction."""
+"""Point at a distance along a direction."""
 
 
 def start(near: Sequence[str] = (), **fields: np.ndarray) -> State:
     """State of one environment.
 
     Args:
-        near: Manipulators at the block; the others are out of its way.
-        **fields: ``x``, ``v``, ``C`` or ``F`` where they are not those of the block at rest.
+        near: Manipulators at the block; the others are far away.
+        **fields: ``x``, ``v``, ``C`` or ``F``, if they differ from the block at rest.
     """
     rows = []
     for kind, m in zip(KINDS, SCENE.manipulators, strict=True):
@@ -162,7 +163,7 @@ def components(kind: str) -> list[int]:
 
 
 def put(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
-    """Set initial states and materials, those of the last point in what is left of the batch.
+    """Set initial states and materials; the last point fills the rest of the batch.
 
     Returns:
         The actions, shape [batch, STEPS, A].
@@ -184,7 +185,7 @@ def world_scene(world: np.ndarray) -> Scene:
 
 
 def losses(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
-    """Trajectory losses of any number of points, simulated a batch at a time."""
+    """Trajectory losses of any number of points, simulated in batches."""
     out = []
     for at in range(0, len(points), BATCH):
         part = points[at : at + BATCH]
@@ -194,10 +195,9 @@ def losses(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
 
 
 def check_slopes(sim: Simulator, ways: Mapping[str, tuple[Way, float]]) -> None:
-    """Compare slopes from the gradient with central differences of the best width.
+    """Compare directional derivatives from the gradient with central differences at the best width.
 
-    Directions in which the loss hardly changes, less than a hundredth of the largest change, are judged
-    relative to that.
+    Directions with less than a hundredth of the largest change are compared relative to that.
     """
     points = [way(s * h) for way, _ in ways.values() for h in SIZES for s in (1.0, -1.0)]
     values = losses(sim, points).reshape(len(ways), len(SIZES), 2)
@@ -218,7 +218,7 @@ def state_way(point: Point, name: str, direction: np.ndarray) -> Way:
 
 
 def pose_way(point: Point, direction: np.ndarray) -> Way:
-    """Moves along a direction, and back to quaternions of unit length."""
+    """Move poses along a direction, and normalise the quaternions."""
 
     def at(h: float) -> Point:
         poses = point.state.poses + h * direction
@@ -244,7 +244,7 @@ def test_gradients_by_every_degree_of_freedom_of_every_manipulator(touched: Simu
 
 
 def test_gradients_by_initial_poses(touched: Simulator) -> None:
-    """Positions, rotations (along the unit quaternions) and the chopsticks' gap."""
+    """Positions, rotations (along unit quaternions) and the chopsticks' gap."""
     kinds = [kind for kind in KINDS if kind != "Cylinder"]
     points = [Point(start((kind,))) for kind in kinds]
     touched.rollout(put(touched, points))
@@ -267,7 +267,7 @@ def test_gradients_by_initial_poses(touched: Simulator) -> None:
 
 
 def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
-    """Normal random numbers, the same ones at every call."""
+    """Normal random numbers, equal in every call."""
     return np.random.default_rng(3).normal(scale=scale, size=shape)
 
 
@@ -305,7 +305,7 @@ REGIMES: dict[str, tuple[str, dict[str, np.ndarray], tuple[float, float, float]]
 """Contact models, initial deformations and materials."""
 
 SCALE = {"x": 0.01, "v": 1.0, "C": 30.0, "F": 0.02}
-"""Size of a step of 1 in each part of the state."""
+"""Size of a unit step in each part of the state."""
 
 
 @pytest.mark.parametrize("regime", REGIMES)
@@ -343,7 +343,7 @@ def test_gradients_by_actions_state_and_material_in_every_regime(touched: Simula
 
 
 def check_corner(sim: Simulator, way: Way, exact: float) -> None:
-    """At a corner the slopes to both sides differ, and the gradient is between them or one of them."""
+    """At a kink, one-sided derivatives differ, and the gradient lies between them or equals one."""
     h = 1e-6
     ahead, here, behind = losses(sim, [way(h), way(0.0), way(-h)])
     low, high = sorted(((ahead - here) / h, (here - behind) / h))
@@ -353,7 +353,7 @@ def check_corner(sim: Simulator, way: Way, exact: float) -> None:
 
 
 def test_one_sided_slopes_bracket_the_gradient_at_corners(touched: Simulator) -> None:
-    """On the yield surface, where return mapping flows outwards only, and at the onset of hard contact."""
+    """On the yield surface, where return mapping is one-sided, and at the onset of hard contact."""
     point = Point(start(("Sphere",), F=at_yield()))
     touched.rollout(put(touched, [point]))
     b = point.state.F @ point.state.F.transpose(0, 2, 1)
@@ -385,7 +385,7 @@ TOWARDS = {
 
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_no_particle_gets_deep_into_a_manipulator_that_presses(touched: Simulator, contact: str) -> None:
-    """By 0.75 cells at most: velocities are stopped at the nodes. Without contact the body falls freely."""
+    """At most 0.75 cells, because velocities are stopped at nodes. Without contact the body falls freely."""
     touched.set_contact(contact)
     put(touched, [*(Point(start(near)) for near in TOUCHING.values()), Point(start())])
     touched.reset()
@@ -409,7 +409,7 @@ def test_no_particle_gets_deep_into_a_manipulator_that_presses(touched: Simulato
 
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_gradients_by_friction_and_gravity(touched: Simulator, contact: str) -> None:
-    """A sliding block at each manipulator, and on the floor."""
+    """Blocks sliding on each manipulator, and on the floor."""
     touched.set_contact(contact)
     world = np.array([0.3, 2.0, -30.0, 1.0, *np.linspace(0.2, 0.5, len(KINDS))])
     sliding = np.array([3.0, -1.0, 2.0]) + np.zeros_like(X)

@@ -126,15 +126,13 @@ class Result:
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two arrays as vectors [degrees], accurate for small angles, too; NaN if one of them is
-    0."""
+    """Angle between two arrays as vectors [degrees], accurate for small angles; NaN if one is 0."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
     return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
 
 def lattice(body: Body, spacing: float) -> np.ndarray:
-    """Return particles on a regular lattice with ``spacing`` [domain units] inside a body, shape [particle,
-    3]."""
+    """Return particles on a lattice with ``spacing`` [domain units] in a body, shape [particle, 3]."""
     half = body.half_extent()
     counts = np.maximum(np.round(2.0 * half / spacing).astype(int), 1)
     axes = [(np.arange(n) + 0.5) / n * 2.0 * h - h for n, h in zip(counts, half, strict=True)]

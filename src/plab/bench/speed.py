@@ -106,8 +106,7 @@ def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, ob
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Time environment steps, print rows, and write the requested files; return 1 if a row needs too much
-    memory."""
+    """Time environment steps, print and write rows; return 1 if a row needs too much memory."""
     parser = Parser("plab bench speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configurations, as for plab run -m: task=Move,Rope")
     parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")

@@ -29,8 +29,7 @@ FIRST = 10_000
 
 
 def scores_of(policy: Policy, cfgs: Sequence[Config], batch: EpisodeBatch) -> np.ndarray:
-    """Return the scores of a policy in the hard contact model, shape [configuration]; 0 for diverged
-    episodes."""
+    """Return a policy's scores in the hard contact model, shape [configuration]; 0 after divergence."""
     found: list[float] = []
     for first in range(0, len(cfgs), batch.size):
         own = cfgs[first : first + batch.size]

@@ -28,8 +28,7 @@ SOLID = 0.1
 """Mass above which a node belongs to the target, as a fraction of the largest node mass."""
 
 WARM_UP = 2
-"""Number of warm-up calls after the first, which compiles; the CPU's kernels select their team sizes in
-them."""
+"""Number of warm-up calls after the first, in which the CPU's kernels select their team sizes."""
 
 
 @dataclass(frozen=True)

@@ -158,8 +158,7 @@ def sources_and_words(
 
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
-    """Return the finished runs that match selections, all from one protocol; raise ResultsError if there are
-    none."""
+    """Return the finished runs that match selections; raise ResultsError for none or mixed protocols."""
     from plab.results.run_file import NAMES, ResultsError
     from plab.results.table import rows
 

@@ -158,8 +158,7 @@ def hydra_app() -> Hydra:
 
 
 def _sets_a_value(override: Override) -> bool:
-    """Return whether an override has the form ``key=value``, and is no sweep, file selection, addition or
-    removal."""
+    """Return whether an override is ``key=value`` without sweep, file selection or prefix."""
     group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
     other = group or override.is_sweep_override() or override.is_hydra_override()
     return override.type is OverrideType.CHANGE and not other

@@ -1,5 +1,4 @@
-"""Selection of runs by overrides in the form of a sweep, such as ``task=Rope,Move method=adam
-seed=0,1,2``."""
+"""Selection of runs by overrides as in a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
 
 from __future__ import annotations
 
@@ -75,8 +74,7 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 def leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted keys of a configuration below a key, with their values; empty sections count as
-    values."""
+    """Yield the dotted keys below a key of a configuration, with values; empty sections are values."""
     if not isinstance(node, Mapping) or not node:
         yield key, node
         return

@@ -18,8 +18,7 @@ EXTENSION_TASKS = (
     *("Gripper", "HandFold", "HandLift", "HandPinch", "HandPress", "HandRoll"),
     *("Pour", "SandHeap"),
 )
-"""Extension tasks (articulated models, sand and fluid), excluded from the tables and defaults of the
-suite."""
+"""Extension tasks (articulated models, sand, fluid), excluded from the suite's tables and defaults."""
 
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
 """Methods compared in the paper, in its order."""
@@ -50,8 +49,7 @@ def group_names(group: str) -> list[str]:
 
 @functools.cache
 def shipped_file(group: str, name: str) -> Mapping[str, Any]:
-    """Return the content of one of plab's own files merged over its bases, or nothing if it does not
-    exist."""
+    """Return the content of one of plab's own files merged over its bases; empty if it does not exist."""
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}

@@ -319,8 +319,7 @@ class TaskConfig(ranges.Section):
                 raise ConfigError(f"{path}.cameras.{name}: {error}") from None
 
     def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
-        """Return the scene's bodies, see :meth:`BodyConfig.build`; ConfigError names the key of an invalid
-        body."""
+        """Return the scene's bodies, see :meth:`BodyConfig.build`; ConfigError names an invalid key."""
         bodies = []
         for name, body in self.bodies.items():
             with located(f"task.bodies.{name}"):

@@ -427,8 +427,7 @@ class EpisodeBatch:
         self._new_observer()
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
-        """Store observations and measures, arrays or CUDA tensors; some environments keep their previous
-        ones."""
+        """Store observations and measures, arrays or CUDA tensors; some environments keep theirs."""
 
         def restore(table: Array, old: Array) -> None:
             own = old[kept]
@@ -492,8 +491,7 @@ class EpisodeBatch:
         return done
 
     def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
-        """Advance environments that have reached the target of their stage to the next stage; return the
-        rewards."""
+        """Advance environments that have reached their stage's target; return the rewards."""
         reward = reward + Constants(stages.earned.copy()).like(like)
         stages.note(_on_host(info["score"]))
         reached = _on_host(info["score"]) >= self._success_score
@@ -519,8 +517,7 @@ class EpisodeBatch:
 
     @_alone
     def get_state(self) -> EpisodeState:
-        """Return a copy of the state for :meth:`set_state`; on the CPU, continuing from it is bitwise
-        reproducible."""
+        """Return a copy of the state for :meth:`set_state`; continuing is bitwise exact on the CPU."""
         simulation = self._simulator.state()
         for e in self.failures:
             # Diverged environments are frozen in an arbitrary finite state.
@@ -604,8 +601,7 @@ class EpisodeBatch:
         return terms
 
     def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
-        """Return the steps taken in the episodes, shape [batch]; raise ResetNeeded if an episode has fewer
-        left."""
+        """Return the steps taken, shape [batch]; raise ResetNeeded if an episode has fewer left."""
         if self._steps is None:
             raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)
@@ -717,8 +713,7 @@ class Restorable:
     _spec: EnvSpec | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return arguments, state and random number generators; raise TypeError if the simulator was changed
-        directly."""
+        """Return arguments, state and generators; raise TypeError if the simulator was changed."""
         batch = self.batch
         if batch.changed_by_hand or batch.problem.simulator.changes != batch._changes:
             raise TypeError(

@@ -1,5 +1,4 @@
-"""Goal-conditioned environment wrapper for hindsight replay, with the ``GoalEnv`` interface of
-Gymnasium-Robotics."""
+"""Goal-conditioned environments for hindsight replay, as ``GoalEnv`` of Gymnasium-Robotics."""
 
 from __future__ import annotations
 

@@ -338,8 +338,7 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return the indices of the observed pose entries, 8 per manipulator; the gap is included for
-    grippers."""
+    """Return the indices of the observed pose entries, 8 per manipulator (with gap for grippers)."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.kind.grips for m in scene.manipulators]
     return np.flatnonzero(observed)

@@ -193,8 +193,7 @@ class EpisodeRandomizer:
         return build_scene(cfg)
 
     def _target(self, base: _Base, cfg: Config, scene: Scene) -> Target:
-        """Return the target of a scene, or of the base scene if the target is simulated or read from a
-        file."""
+        """Return the target of a scene; that of the base scene if it is simulated or read from a file."""
         kind = RECIPES[cfg.task.target["recipe"]]
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
@@ -243,8 +242,7 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
 
 
 def staged(cfg: Config) -> bool:
-    """Return True if the task has stages before its target; raise ConfigError if targets are randomised as
-    well."""
+    """Return True if the task has stages; raise ConfigError if its targets are randomised as well."""
     if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
         raise ConfigError("task.randomize cannot have scenes or targets in a task with task.stages")
     return bool(cfg.task.stages)

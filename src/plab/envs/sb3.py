@@ -1,5 +1,4 @@
-"""Vectorised environments in one simulator for Stable-Baselines3: ``make_sb3("plab/Rope-v1",
-num_envs=8)``."""
+"""Vectorised environments for Stable-Baselines3: ``make_sb3("plab/Rope-v1", num_envs=8)``."""
 
 from __future__ import annotations
 

@@ -59,8 +59,7 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
         return _first(*self.batch.reset(seeds=self._first_seeds(seed), options=options))
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one step with an action, shape [action]; see :meth:`plab.envs.core.EpisodeBatch.step`
-        for errors."""
+        """Advance by one step; errors are those of :meth:`plab.envs.core.EpisodeBatch.step`."""
         self.batch.require_running()
         done = self.batch.step(np.asarray(action)[None], strict=False)
         ends = bool(done.terminated[0]), bool(done.cut_off[0])

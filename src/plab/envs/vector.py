@@ -1,5 +1,4 @@
-"""Vectorised environments in one simulator for Gymnasium: ``gymnasium.make_vec("plab/Rope-v1",
-num_envs=8)``."""
+"""Vectorised environments for Gymnasium: ``gymnasium.make_vec("plab/Rope-v1", num_envs=8)``."""
 
 from __future__ import annotations
 

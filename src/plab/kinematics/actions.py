@@ -32,8 +32,7 @@ class LinkMotion:
     """
 
     def __init__(self, given: list[Tensor], made: list[Tensor], as_array: bool) -> None:
-        """Store the inputs ``given`` (actions and joint positions) and the outputs ``made`` (twists and joint
-        positions)."""
+        """Store ``given`` actions and joint positions, and ``made`` twists and joint positions."""
         self._given, self._made, self._as_array = given, made, as_array
         self.twists, self.joints = map(self._out, made)
 

@@ -122,8 +122,7 @@ class Chain:
         return joints, tuple((link.parent, link.shape) for link in self.links)
 
     def frames(self, positions: Sequence[float]) -> np.ndarray:
-        """Transforms from the links' frames to the world, shape [link, 4, 4], given joint positions, shape
-        [joint]."""
+        """Transforms from links to the world, shape [link, 4, 4], for joint positions, shape [joint]."""
         world: list[np.ndarray] = []
         for joint, position in zip(self.joints, positions, strict=True):
             above = world[joint.parent] if joint.parent >= 0 else np.eye(4)

@@ -58,8 +58,7 @@ def read_model(
 
 
 def locate_model(model: str) -> str:
-    """Return the location of a model file, see :func:`plab.files.pinned`; files in packages are returned
-    unchanged."""
+    """Return the path of a model file, see :func:`plab.files.pinned`, unless it is in a package."""
     inside_package = ":" in model and not os.path.exists(model)
     return model if inside_package else pinned(os.path.expanduser(model))[0]
 

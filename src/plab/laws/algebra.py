@@ -151,8 +151,7 @@ def inverse_cbrt(j, steps):
 
 
 def log_coefficients(i1, i2, i3, terms):
-    """Coefficients a1, a2 of Z and Z^2 in atanh(Z) by Horner's rule; the coefficient of I drops out of the
-    deviator."""
+    """Coefficients of Z and Z^2 in atanh(Z) by Horner's rule; that of I drops out of the deviator."""
     n13 = i1 * i3
     n23 = i3 - i1 * i2
     n33 = i1 * i1 - i2

@@ -1,5 +1,4 @@
-"""Picture files: strips of initial state, target and final state, films, and sets of both for the results
-page."""
+"""Picture files: strips of initial, target and final state, films, and sets for the results page."""
 
 from __future__ import annotations
 

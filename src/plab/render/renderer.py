@@ -118,8 +118,7 @@ class Renderer:
         return self._draw()
 
     def target(self, poses: np.ndarray) -> np.ndarray:
-        """Render the target as plasticine, with the static manipulators; arguments and result as in
-        :meth:`frame`."""
+        """Render the target as plasticine, with static manipulators; see :meth:`frame`."""
         if self._target is None:
             raise ArgumentError("this renderer has no target: pass target_mass")
         self._set_up(poses, moving=False)

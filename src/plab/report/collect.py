@@ -1,5 +1,4 @@
-"""Selection of finished runs of the suite that can be averaged because they differ only in seed and
-variant."""
+"""Selection of finished runs that can be averaged because they differ only in seed and variant."""
 
 from __future__ import annotations
 
@@ -71,8 +70,7 @@ class Runs:
 
     @property
     def digest(self) -> str:
-        """SHA-256, in hex, of the runs' configurations, evaluations and times, which does not depend on file
-        locations."""
+        """SHA-256, in hex, of configurations, evaluations and times, independent of file locations."""
         records = self.table.drop(columns="path").to_dict("records")
         lines = sorted(
             json.dumps({name: value for name, value in row.items() if value == value}, sort_keys=True)

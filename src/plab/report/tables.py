@@ -201,8 +201,7 @@ def iou_per_configuration(runs: Runs) -> list[Table]:
 
 
 def distances(runs: Runs) -> list[Table]:
-    """Return the distances of final shapes from their targets, per task and method, or nothing if no run has
-    them."""
+    """Return the distances of final shapes from targets per task and method, or nothing."""
     shown, data = [], []
     for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), DISTANCES):
         if name not in runs.table:

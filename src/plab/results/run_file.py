@@ -61,8 +61,7 @@ _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016; groups and small data sets take a third of the space of the oldest format."""
 
 _RATIO, _SMALL = 1_100, 1 << 16
-"""Maximum compression ratio of a dataset (deflate reaches 1,032), and the size below which any ratio is
-accepted."""
+"""Maximum compression ratio of a dataset (deflate: 1,032), and minimum size for this limit."""
 
 _images = itertools.count()
 

@@ -157,8 +157,7 @@ class RunFile:
         return self.result.rows > self._known
 
     def release(self) -> None:
-        """Release the run's lock, so that another process may resume the run; nothing may be written
-        afterwards."""
+        """Release the run's lock, so that another process may resume the run; then write nothing."""
         if self._lock is not None:
             self._lock.release()
 

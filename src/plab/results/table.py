@@ -250,8 +250,7 @@ def read_each(
 
 
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file; rows of unchanged files come from the
-    index."""
+    """Yield the rows below a folder or of a file; rows of unchanged files come from the index."""
     files = dict(run_files(root))
     # A finished file replaces its partial file.
     for path in [path for path in files if path.name.endswith(PARTIAL_SUFFIX)]:
@@ -289,8 +288,7 @@ def _final(partial: Path) -> Path:
 
 
 def _read(path: Path) -> list[Row | ResultsError]:
-    """Return the rows of a file, or of the final file if the partial file has been replaced in the
-    meantime."""
+    """Return the rows of a file, or of the final file if it has replaced the partial file."""
     entries = list(read_rows(path))
     if not path.exists():
         return list(read_rows(_final(path))) if _final(path).exists() else []

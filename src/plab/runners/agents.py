@@ -111,8 +111,7 @@ class AgentRandom:
         return self._rest[use].pop()
 
     def states(self) -> list[np.ndarray]:
-        """Return the state of each generator, and drop the blocks, because a resumed process starts without
-        them."""
+        """Return each generator's state, and drop the blocks, because a resumed process has none."""
         self._rest = {}
         return [generator.get_state().numpy() for generator in self._generators]
 
@@ -138,13 +137,11 @@ class Sizes(NamedTuple):
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def window(self, buffer_size: int) -> int:
-        """Return how many of the latest steps of N environments can be sampled, given the number of
-        transitions."""
+        """Return how many of the latest steps of N environments can be sampled, given transitions."""
         return max(buffer_size // self.envs, 1)
 
     def capacity(self, buffer_size: int, total_steps: int) -> int:
-        """Return how many episodes of N environments a buffer holds, given the number of training
-        transitions."""
+        """Return how many episodes of N environments a buffer holds, given training transitions."""
         # One more, because the oldest samples may begin, and the latest end, within an episode.
         held = math.ceil(self.window(buffer_size) / self.horizon) + 1
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
@@ -169,8 +166,7 @@ class ReplayBuffer:
     def __init__(
         self, agents: int, sizes: Sizes, buffer_size: int, total_steps: int, device: torch.device
     ) -> None:
-        """Allocate a buffer for the latest transitions of each agent, given the number of training
-        transitions."""
+        """Allocate each agent's buffer for the latest transitions, given their number in the training."""
         self.added = 0
         self._sizes, self._window = sizes, sizes.window(buffer_size)
         self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
@@ -448,8 +444,7 @@ class Agents:
         """Return Stable-Baselines3's policy with initial weights, on the CPU."""
 
     def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
-        """Return Stable-Baselines3's policy with an agent's networks, and the scaling of its observations, if
-        any."""
+        """Return Stable-Baselines3's policy with an agent's networks and observation scaling, if any."""
         policy: Any = first_policy(self.method, self._spaces)
         own = dict(policy.named_parameters())
         with torch.no_grad():
@@ -474,8 +469,7 @@ class Agents:
 
     @abstractmethod
     def act(self, observations: Tensor) -> Tensor:
-        """Return exploratory actions, shape [agent, env, action], for observations, shape [agent, env,
-        entry]."""
+        """Return exploratory actions, shape [agent, env, action], for observations of all environments."""
 
     @abstractmethod
     def decide(self, observations: Tensor) -> Tensor:

@@ -52,8 +52,7 @@ class ApgRunner(Runner):
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Create network and optimiser, with torch's default initial weights, or restore them from the
-        file."""
+        """Create network, with torch's default initial weights, and optimiser, or restore them."""
         entries, action_dim = Spaces.of(self._episode).sizes
         widths = itertools.pairwise([entries, *self.method.hidden, action_dim])
         with torch.random.fork_rng(devices=[]):

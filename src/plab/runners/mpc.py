@@ -173,8 +173,7 @@ class MpcRunner(PlannerRunner):
             self.problem.simulator.set_initial_state(self._beginning)
 
     def _execute(self, actions: np.ndarray) -> None:
-        """Execute actions, shape [k, A], in the hard contact model, and use the resulting state for the next
-        plan."""
+        """Execute actions, shape [k, A], in the hard contact model; plan next from the resulting state."""
         simulator = self.problem.simulator
         simulator.set_contact("hard")
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)

@@ -331,8 +331,7 @@ class PlannerRunner(Runner):
         return torch.Generator(self._device).manual_seed(int(seed) >> 1)
 
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
-        """Evaluate candidates of some runs, the same number per run; a run whose candidates all diverge
-        fails."""
+        """Evaluate equally many candidates per run; a run whose candidates all diverge fails."""
         first, width = next(iter(requests.values())), self._width
         count, reasons = len(first.actions), dict[int, str]()
         # Ordered by candidate and run; each batch fills all environments.
@@ -367,8 +366,7 @@ class PlannerRunner(Runner):
 
 
 def _smallest_population(method: Any) -> int:
-    """Return the smallest number of candidates evaluated at once; more environments would sometimes be
-    idle."""
+    """Return the smallest number of candidates evaluated at once, which keeps environments busy."""
     if hasattr(method, "stages"):
         return min(map(_smallest_population, method.stages.values()))
     return method.population

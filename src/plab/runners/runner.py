@@ -322,8 +322,7 @@ class Runner:
         return nullcontext()
 
     def extent(self) -> tuple[int, int, int]:
-        """Return the progress: number of completed steps, total, and interval of reports without a
-        terminal."""
+        """Return the progress: steps done, total, and interval of reports without a terminal."""
         total = max(self.iterations(track) for track in self.tracks)
         return min(track.iteration for track in self.tracks), total, PLAIN_EVERY
 
@@ -570,8 +569,7 @@ class RunLog:
         self._close: Callable[[], object] = lambda: None
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers by name at an environment step, omitting non-finite ones; raise ResultsError on
-        failure."""
+        """Log finite numbers by name at an environment step; raise ResultsError on failure."""
         if not self.wanted:
             return
         try:

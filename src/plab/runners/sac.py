@@ -57,8 +57,7 @@ class SacAgents(OffPolicyAgents):
 
     @staticmethod
     def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
-        """Return Stable-Baselines3's policy with the authors' initial weights: Glorot uniform, zero
-        biases."""
+        """Return Stable-Baselines3's policy with Glorot uniform weights and zero biases."""
         from stable_baselines3.sac.policies import SACPolicy
 
         policy = SACPolicy(

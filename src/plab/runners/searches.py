@@ -161,8 +161,7 @@ def knots_of(actions: Tensor, knots: int) -> Tensor:
 
 
 class Sampler(Planner):
-    """Planner that evaluates the starts, then samples curves around the best one and learns from their
-    costs."""
+    """Planner that evaluates starts, samples curves around the best, and learns from their costs."""
 
     method: SamplerConfig
 
@@ -214,8 +213,7 @@ class Sampler(Planner):
 
     @abstractmethod
     def learn(self, points: Tensor, cost: Tensor) -> None:
-        """Learn from curves, shape [P, K, A], and their costs, shape [P], infinite for diverged
-        candidates."""
+        """Learn from curves, shape [P, K, A], and costs, shape [P], infinite after divergence."""
 
     def noise(self, random: torch.Generator) -> Tensor:
         """Sample standard normal numbers, shape [P, K, A]."""

@@ -95,8 +95,7 @@ class Td3Agents(OffPolicyAgents):
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
     def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update critics, actor and targets, with the arguments of :meth:`critics`; return losses, shape [2,
-        agent]."""
+        """Update critics, actor and targets, as :meth:`critics`; return losses, shape [2, agent]."""
         samples = self.replay.sample(numbers)
         critic_loss = self._update_critics(samples, noise)
         actions = self._actor("actor", samples.observations)

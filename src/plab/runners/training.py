@@ -178,8 +178,7 @@ class PolicyRunner(Runner, ABC):
     # ------------------------------------------------------------------------------------------------ hooks
 
     def environments(self, cfg: Config) -> list[Config]:
-        """Return the configurations of a run's training environments, or none if the method needs no
-        simulations."""
+        """Return the configurations of training environments; none if no simulations are needed."""
         return [cfg] * cast(Any, cfg.method).num_envs
 
     @abstractmethod
@@ -224,8 +223,7 @@ class PolicyRunner(Runner, ABC):
     # ------------------------------------------------------------------------------- shared implementation
 
     def set_cycle(self, batch: EpisodeBatch, cycle: int) -> None:
-        """Plan ``method.episodes`` episodes in cycles, given the number of transitions per cycle and
-        policy."""
+        """Plan ``method.episodes`` episodes, given the number of transitions per cycle and policy."""
         self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
         self.total_steps = whole_cycles(self.method.episodes * self._horizon, cycle)
 
@@ -409,8 +407,7 @@ class ActorRunner(PolicyRunner):
         return training_scenes(cfg, method, method.num_envs)
 
     def prepare(self, batch: EpisodeBatch) -> None:
-        """Initialise; the configuration's seed determines the initial weights and all later random
-        numbers."""
+        """Initialise; the configuration's seed determines initial weights and all random numbers."""
         from stable_baselines3.common.running_mean_std import RunningMeanStd
 
         self.set_cycle(batch, self.round_episodes[0] * batch.size * batch.horizon)

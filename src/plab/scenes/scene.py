@@ -86,8 +86,7 @@ def vector3(values: Sequence[float]) -> Vec3:
 
 
 def find_law(name: str) -> Law:
-    """Return a law by name, or by ``module:NAME`` for a law outside plab; raise ConfigError if it does not
-    exist."""
+    """Return a law by name, or an external law by ``module:NAME``; raise ConfigError if it is missing."""
     found: Law = LAWS.find(name, "law")
     return found
 
@@ -510,8 +509,7 @@ class Scene:
         return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
 
     def facts(self) -> dict[str, Any]:
-        """Return the scene as plain data, without meshes and without values that bodies inherit from the
-        scene."""
+        """Return the scene as plain data, without meshes and inherited values of bodies."""
         facts = asdict(self)
         if self.kinematics is None:
             del facts["kinematics"]
@@ -522,8 +520,7 @@ class Scene:
         return facts
 
     def validate(self) -> None:
-        """Raise SceneError if the scene cannot be simulated; the message names the field and a valid
-        value."""
+        """Raise SceneError, which names the field and a valid value, for an invalid scene."""
         _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):

@@ -34,8 +34,7 @@ def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
 
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
-    """Raise SceneError if scenes, and the scene ``like`` if given, cannot be simulated or cannot share a
-    simulator."""
+    """Raise SceneError if scenes (and ``like``) cannot be simulated or cannot share a simulator."""
     if isinstance(scenes, Scene):
         raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
     if not scenes:

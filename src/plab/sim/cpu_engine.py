@@ -134,8 +134,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def grid_chunk(self, e, c, s):
-        """Update the grid in a part of the environment's blocks, and clear the private grids for the next
-        substep."""
+        """Update the grid in some of the environment's blocks, and clear the private grids."""
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
             holders = self.block_chunks[e * self.blocks + block]
@@ -244,8 +243,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 
     @ti.func
     def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
-        """Backpropagate all manipulators' motion in substep s: ``pose_bar`` goes from its end to its
-        start."""
+        """Backpropagate manipulator motion in substep s: ``pose_bar`` goes from its end to its start."""
         for _shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
@@ -339,8 +337,7 @@ class TeamChoice:
     """
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first of several teams, given by their numbers of threads; try the others in
-        order."""
+        """Start with the first of several teams, given by numbers of threads; try the others in order."""
         self._seconds: dict[int, deque[float]] = {size: deque(maxlen=TIMED_LAUNCHES) for size in sizes}
         self._launches, self._probe_at = 0, PROBE_FIRST
 
@@ -393,8 +390,7 @@ class CpuEngine(CpuPhases):
         self._teams["losses"].run(self.losses_kernel, args)
 
     def step_adjoint(self, state: ti.Ndarray, bar: ti.Ndarray, *args: object) -> None:
-        """Run the adjoint of one step; arguments as for :meth:`step_adjoint_kernel`, without size and
-        addresses."""
+        """Run the adjoint of one step; arguments as for its kernel, without size and addresses."""
         arrays = state, address_of(state), bar, address_of(bar)
         self._teams["step_adjoint"].run(self.step_adjoint_kernel, (*arrays, *args))
 

@@ -186,8 +186,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def gather_particle_adjoint(self, state_at, source, after, bar_at, target, entry9, lane, node, at):
-        """Adjoint of both transfers of one particle, for x and v in the array at ``bar_at`` and A in
-        ``affine``."""
+        """Adjoint of a particle's transfers, for x and v in the array at ``bar_at``, A in ``affine``."""
         addresses = [
             ti.get_addr(self.velocity, [node]),
             ti.get_addr(self.momentum_bar, [node]),
@@ -258,8 +257,7 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def put_parameters(self, e, entry9, at, first: ti.template(), count: ti.template()):
-        """Write a tile's coefficients and, if there are several laws, each lane's law number to
-        ``strains``."""
+        """Write a tile's coefficients and, with several laws, each lane's law number to ``strains``."""
         p = self.parameters_of_tile(e, entry9)
         for i in ti.static(range(count)):
             self.strains[at + first + i] = p[i]

@@ -37,8 +37,7 @@ MULTIPROCESSORS, SHARED_BYTES = 16, 81
 
 
 def device_attribute(number: int) -> int:
-    """Return an attribute of the CUDA device from the driver, because Taichi does not provide it; 1 on
-    failure."""
+    """Return a driver attribute of the CUDA device, which Taichi does not provide; 1 on failure."""
     value = ctypes.c_int(0)
     driver = cuda_driver()
     if driver is not None:

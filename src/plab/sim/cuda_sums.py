@@ -209,6 +209,5 @@ class SumPhases(Storage):
 
     @ti.func
     def bits_of(self, bound):
-        """Return the bits of a nonnegative float32, which sort like the numbers, followed by infinity and
-        NaN."""
+        """Return the bits of a nonnegative float32: sorted like numbers, then infinity and NaN."""
         return ti.bit_cast(ti.cast(bound, ti.f32), ti.i32) & 0x7FFFFFFF

@@ -76,8 +76,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     particle_threads: int
 
     def gathered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid that particles gather from, read by :meth:`node4` and written by
-        :meth:`put_nodes`."""
+        """Allocate a grid that particles gather from; :meth:`node4` reads, :meth:`put_nodes` writes it."""
         if self.real == ti.f32:
             return ti.field(ti.i64, shape=2 * nodes)
         return super().gathered_grid(nodes)

@@ -1,5 +1,4 @@
-"""Grid phases of a substep and their adjoints: gravity, contact with manipulators, Coulomb friction and
-walls."""
+"""Grid phases of a substep and adjoints: gravity, contact, Coulomb friction and walls."""
 
 import math
 

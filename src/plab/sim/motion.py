@@ -230,8 +230,7 @@ class PosePhases(Storage):
 
     @ti.func
     def substep_motion(self, e, start: ti.template(), m, actions: ti.template(), t):
-        """Motion of manipulator m per substep from its action, clipped and scaled if its shape requires
-        it."""
+        """Motion of manipulator m per substep from its action, clipped and scaled as its shape requires."""
         u = vec7(0.0)
         entry = self.action_of(e, start, m, t)
         for i in ti.static(range(self.action_dims[start])):
@@ -290,8 +289,7 @@ class PosePhases(Storage):
 
     @ti.func
     def set_frame(self, e, s, m):
-        """Compute centre, rotation and rates of a manipulator in substep s; the rates are float64
-        differences."""
+        """Compute centre, rotation and rates (float64 differences) of a manipulator in substep s."""
         start = self.pose[e, s, m]
         end = self.pose[e, s + 1, m]
         r0 = rotation_matrix(quaternion(start))

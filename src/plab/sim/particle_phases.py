@@ -226,8 +226,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def place_of(self, entry):
-        """Number of a tile among the tiles of all environments, given its first entry in a state of any time
-        slot."""
+        """Number of a tile in all environments, given its first entry in a state of any time slot."""
         return entry // STATE % (self.batch * self.tiles)
 
     @ti.func
@@ -288,8 +287,7 @@ class ParticlePhases(Storage):
 
     @ti.func
     def block_along(self, base):
-        """Block of a base node along an axis, and 1 if its stencil extends into the next block, otherwise
-        0."""
+        """Block of a base node along an axis, and 1 if its stencil enters the next block, else 0."""
         return base >> BLOCK_BITS, ((base & (BLOCK - 1)) + 2) >> BLOCK_BITS
 
     @ti.func

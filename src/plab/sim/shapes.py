@@ -53,8 +53,7 @@ def ball_hessian_product(q, w):
 
 @ti.func
 def rod_hessian_product(q, w):
-    """Hessian-vector product of the distance from a segment of the y axis; q is relative to its nearest
-    point."""
+    """Hessian-vector product of the distance from a segment on the y axis; q is the offset from it."""
     masked = w
     # Along the straight part the distance does not depend on y.
     if q[1] == 0.0:

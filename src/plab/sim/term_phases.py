@@ -277,8 +277,7 @@ class TermPhases(Storage):
 
     @ti.func
     def distance_gradient(self, shape: ti.template(), e, m, particle, x):
-        """Adjoints of a particle's position and a manipulator's pose under distance terms over all
-        particles."""
+        """Adjoints of a particle's position and a manipulator's pose under terms over all particles."""
         x_bar = x * 0.0
         pose_bar = vec8(0.0)
         for k, _column, term in ti.static(self.distance_terms):

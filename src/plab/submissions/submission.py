@@ -287,8 +287,7 @@ def excess(submission: Submission) -> str | None:
 
 
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
-    """Return an entry of the manifest with its actions; raise ValueError, KeyError or TypeError for errors in
-    it."""
+    """Return an entry of the manifest; raise ValueError, KeyError or TypeError for errors in it."""
     configuration = Configuration(record["task"], record["variant"])
     known = configuration.task in suite_tasks() and configuration.variant in VARIANTS
     _require(known, f"{where}: the leaderboard has no {configuration}")

@@ -1,5 +1,4 @@
-"""Mass tensors for the ``target`` sections of tasks, their cache, and target files of the original
-release."""
+"""Mass tensors for ``target`` sections of tasks, their cache, and target files of the release."""
 
 from __future__ import annotations
 

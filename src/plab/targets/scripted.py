@@ -64,8 +64,7 @@ class ActionTrack:
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if the motion is
-        longer."""
+        """Return the actions of an episode, shape [EPISODE_STEPS, A]; raise _TooLong if they exceed it."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
@@ -179,8 +178,7 @@ class DrawTarget(Script):
         track.go([0.0, depth + tool.size[1], 0.0])
 
     def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Sample a stroke [2] from a position [2] such that it ends within +-room [2] of the body's
-        centre."""
+        """Sample a stroke [2] from a position [2] that ends within +-room [2] of the body's centre."""
         for _ in range(DRAWS):
             angle, length = rng.uniform(0, 2 * math.pi), _draw(rng, "length", self.length)
             way = length * np.array([math.cos(angle), math.sin(angle)])

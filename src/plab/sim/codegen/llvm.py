@@ -37,8 +37,7 @@ class Code:
     def __init__(
         self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str, *, grid: bool = True
     ) -> None:
-        """Begin a function with named arguments: addresses, optionally the grid's nodes per axis, and
-        numbers."""
+        """Begin a function with named addresses, optionally the grid's nodes per axis, and numbers."""
         self.real = real
         self.single = isinstance(real, ir.FloatType)
         kinds = {
@@ -111,8 +110,7 @@ class Code:
         return self.add(self.mul(n, self.constant(high)), rest)
 
     def _ln2(self) -> tuple[float, float]:
-        """ln 2 as a leading term with few digits, whose products with small integers are exact, plus a
-        remainder."""
+        """ln 2 as a leading term, whose products with small integers are exact, and a remainder."""
         bits = 15 if self.single else 32
         high = math.ldexp(math.floor(math.ldexp(math.log(2.0), bits)), -bits)
         return high, math.log(2.0) - high

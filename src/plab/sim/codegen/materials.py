@@ -34,8 +34,7 @@ Maker = Callable[[ir.Module, str, ir.Type], None]
 
 
 def scattered_matrix(tau: Sequence[Any], c: Sequence[Any], stress_scale: Any, mass: Any) -> list[Any]:
-    """A = stress_scale tau + mass C, the matrix that a particle scatters, for symmetric tau (6) and full C
-    (9)."""
+    """A = stress_scale tau + mass C, scattered by a particle, for symmetric tau (6) and full C (9)."""
     return [stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + mass * c[i] for i in range(9)]
 
 

@@ -64,8 +64,7 @@ class Stencil(Code):
         return self.dot(parts, [self.splat(weight, 4) for weight in weights])
 
     def moments(self, sums: Sums, z: Sequence[ir.Value]) -> list[ir.Value]:
-        """Sums of w g, and of w g times the node offsets along x, y and z, as 4-vectors, by weights along
-        z."""
+        """Sums of w g, and of w g times node offsets along x, y and z, 4-vectors, by weights along z."""
         of_x, of_y = self.reduced(sums.x, z), self.reduced(sums.y, z)
         return [
             self.reduced(sums.plain, z),
