@@ -141,7 +141,10 @@ def assert_same_state(got: State, e: int, want: reference.State) -> None:
 
 
 def make_not_finite(simulator: Simulator, env: int) -> None:
-    """Set the velocity of a particle of an environment to NaN."""
-    state = simulator.state()
+    """Give a particle of an environment a velocity that is not a number, which set_state() refuses; steps
+    are counted from here."""
+    state, particles = simulator.state(), simulator._particles
     state.v[env, 5] = np.nan
-    simulator.set_state(state)
+    particles.current.from_numpy(particles.pack(state))
+    particles.reset_order()
+    simulator._place(state.poses)

@@ -21,7 +21,6 @@ from plab.runners.shac import td_lambda
 from plab.runners.training import DEVIATION_MIN, shared_batches, training_scenes
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
-from test_rl import break_evaluation
 from toy_runner import COARSE_32
 
 HORIZON = 5
@@ -129,18 +128,6 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunRe
     run(cfg)
     again = finished_as(cfg, finished)
     assert policy_path(again.path).read_bytes() == policy_path(finished.path).read_bytes()
-
-
-def test_an_evaluation_that_breaks_off_ends_nothing(
-    tmp_path: Path, finished: RunResult, monkeypatch, caplog
-) -> None:
-    break_evaluation(monkeypatch, 1)
-    result = run(make_config(tmp_path, name_of(finished)))
-    assert result.provenance["broken_evaluations"] == 1 and result.best_iteration != 1
-    rows, whole = result.iterations["loss"], finished.iterations["loss"]
-    assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert "iteration 1" in told
 
 
 def test_targets_look_ahead_as_far_as_lambda_says() -> None:

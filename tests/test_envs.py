@@ -96,14 +96,6 @@ def test_checkers_find_nothing(env: PlabEnv) -> None:
     assert [str(w.message) for w in record] == []
 
 
-def test_trials_are_the_simulators_rollouts(env: PlabEnv) -> None:
-    problem, actions = env.batch.problem, random_actions()[:, :1].swapaxes(0, 1)
-    tried = problem.try_out(actions, gradient=False)
-    losses = problem.loss_of(problem.simulator.rollout(actions, gradient=False).step_terms)
-    np.testing.assert_allclose(tried.final_loss, losses[:, -1])
-    np.testing.assert_allclose(tried.measures["loss"], losses.sum(axis=1))
-
-
 def test_an_episode_is_that_of_the_simulator_and_the_objective(env: PlabEnv) -> None:
     problem, ends = env.batch.problem, []
     start, first = env.reset(seed=5)

@@ -172,7 +172,7 @@ def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> Non
     sim.reset()
     start = sim.state()
     make_not_finite(sim, 1)
-    sim.set_initial_state(sim.state())
+    sim._engine.copy_slot(sim._particles.current, 0, sim._initial, 0)
     with pytest.raises(SimulationError) as caught:
         sim.rollout(ACTIONS)
     assert list(caught.value.failures) == [1]
@@ -188,9 +188,17 @@ def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> Non
 
 
 def test_arguments_are_checked(sim: Simulator) -> None:
-    out = sim.state()
+    out, still = sim.state(), sim.state()
     out.x[1, 2] = 0.95
+    grids = np.zeros((2, 3, *[sim.grid_size] * 3))
+    grids[1, 2, 3, 4, 5] = math.inf
     make = partial(Simulator, device=DEVICE)
+
+    def wrong(part: str, at: tuple[int, ...], value: float) -> object:
+        values = getattr(still, part).copy()
+        values[at] = value
+        return replace(still, **{part: values})
+
     for call, named in (
         (lambda: sim.step(np.zeros((3, 5))), "actions"),
         (lambda: sim.step(np.full((3, 6), math.nan)), "NaN"),
@@ -199,20 +207,30 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         (lambda: sim.set_contact(["soft"] * 4), "contact has 4 values for 3 environments"),
         (lambda: sim.set_material(yield_stress=[1.0] * 4), r"yield_stress has shape \(4,\), .* \[3, 1\]"),
         (lambda: sim.change_scenes(SCENES[:2], {}), "2 scenes for a simulator of 3"),
-        (lambda: sim.set_scenes(SCENES[::-1], particles=out.x * math.nan), "particle 0 is at"),
+        (lambda: sim.set_target(*grids), r"target sdf: environment 2, node \(3, 4, 5\) has inf"),
+        (lambda: sim.set_target(*grids[::-1]), r"target mass: environment 2, node \(3, 4, 5\)"),
+        (lambda: sim.set_scenes(SCENES[::-1], particles=out.x), r"particles\[1\]: particle 2 is at"),
         (lambda: sim.set_material(poisson_ratio=0.7), "poisson_ratio"),
         (lambda: replace(ball(), dt=0.1).validate(), "substeps >= "),
         (lambda: ball(center=(0.5, 0.95, 0.5)).validate(), "outside the domain"),
         (lambda: make([ball()], particles=[np.full((7, 3), 0.5)]), "particles are 7, .* has 300"),
         (lambda: sim.set_state(out), "environment 1, particle 2 is at .*, outside -0.03125 .. 0.9062"),
         (lambda: sim.set_initial_state(replace(out, x=out.x * math.nan)), r"particle 0 is at \(nan"),
+        (lambda: sim.set_state(replace(out, x=out.x[:, :7])), r"x has shape \(3, 7, 3\), not \(3, 300, 3\)"),
+        (lambda: sim.set_state(wrong("v", (1, 2, 0), math.nan)), "v: environment 1, particle 2 .*nan"),
+        (lambda: sim.set_initial_state(wrong("F", (2, 9), 1e39)), "F: environment 2, particle 9 .*inf"),
+        (lambda: sim.set_state(wrong("C", (0, 4, 1, 1), -math.inf)), "C: environment 0, particle 4 .*inf"),
+        (lambda: sim.set_state(wrong("poses", (1, 1, 3), math.nan)), "poses: environment 1, manipulator 1"),
         (lambda: make([ball(), replace(ball(), manipulators=())]), "manipulators"),
         (lambda: Simulator(SCENES, device="gpu"), "device 'gpu' is not one of cpu, cuda"),
         (lambda: make(SCENES, precision="f64"), "precision 'f64' is not one of float32, float64"),
     ):
-        with pytest.raises(ValueError, match=named):
+        with pytest.raises(ValueError, match=named) as caught:
             call()
+        assert "\n" not in str(caught.value)
     assert sim.scenes == SCENES
+    for part, before in vars(still).items():
+        assert np.array_equal(getattr(sim.state(), part), before), part
     for gradient in (sim.material_gradient, sim.state_gradient, sim.world_gradient):
         with pytest.raises(RuntimeError, match="full_gradient=True"):
             gradient()

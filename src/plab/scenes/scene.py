@@ -591,9 +591,9 @@ class Scene:
         _require(abs(norm - 1.0) < 1e-3, f"{label} needs a unit quaternion: rotation has length {norm:.4g}")
         friction = f"{label} has friction {tool.friction:g}: it must be finite and at least 0"
         _require(0 <= tool.friction < math.inf, friction)
-        for name in ("position", "scale"):
+        for name in ("position", "scale", "gap"):
             values = getattr(tool, name)
-            _require(all(map(math.isfinite, values)), f"{label} needs a finite {name}, not {values}")
+            _require(bool(np.isfinite(values).all()), f"{label} needs a finite {name}, not {values}")
         low, high = tool.lower_bound, tool.upper_bound
         ordered = all(a <= b for a, b in zip(low, high, strict=True))
         _require(ordered, f"{label} has a lower_bound {low} above its upper_bound {high}")

@@ -87,6 +87,20 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
     return x
 
 
+def require_finite(name: str, values: np.ndarray, entry: str, axes: int = 1) -> None:
+    """Raise ValueError if a number is NaN or infinite, naming its environment and its ``entry``, by the
+    indices along the ``axes`` after the first."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        environment, *where = np.argwhere(~finite)[0].tolist()[: axes + 1]
+        number = where[0] if axes == 1 else tuple(where)
+        found = np.ravel(values[(environment, *where)]).tolist()
+        raise ArgumentError(
+            f"{name}: environment {environment}, {entry} {number} has {', '.join(map(str, found))}: "
+            f"must be finite in {values.dtype}"
+        )
+
+
 def material_keys(scene: Scene) -> tuple[str, ...]:
     """Return the names of the parameters of a scene's laws, in the order of gradients."""
     return tuple(dict.fromkeys(key for law in scene.laws for key in find_law(law).keys))

@@ -18,6 +18,7 @@ from plab.sim.batch import (
     material_keys,
     parameter_gradient,
     require_alike,
+    require_finite,
     with_material,
 )
 from plab.sim.compiler import ti
@@ -260,16 +261,18 @@ class Simulator:
             sdf: Distance of each node to the target [domain units], same shape.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If a shape is wrong, or a number is NaN or infinite.
         """
         self._require_runtime()
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
         for name, value in (("mass", mass), ("sdf", sdf)):
             if np.shape(value) != expected:
                 raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
+        held = {"mass": self._real(mass), "sdf": self._real(sdf)}
+        for name, value in held.items():
+            require_finite(f"target {name}", value, "node", axes=3)
         self.changes += 1
         self.target_mass = np.asarray(mass)
-        held = {"mass": np.asarray(mass, self._numpy_real), "sdf": np.asarray(sdf, self._numpy_real)}
         for name, field in self._engine.references.items():
             self._engine.write(field, held[name])
         for term in self._engine.terms:
@@ -291,7 +294,7 @@ class Simulator:
         """
         self._require_runtime()
         self._require_fitting(scenes)
-        held = {e: self._checked_particles(x) for e, x in particles.items()}
+        held = {e: self._checked_particles(x, f"particles[{e}]") for e, x in particles.items()}
         self.scenes = tuple(scenes)
         self.changes += 1
         self._version += 1
@@ -468,7 +471,8 @@ class Simulator:
             state: Shapes as in :class:`State`.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If a shape is wrong, a position is outside the grid, or a number is NaN or infinite;
+                nothing is changed then.
         """
         self._require_runtime()
         tails = {"x": (3,), "v": (3,), "C": (3, 3), "F": (3, 3)}
@@ -480,12 +484,22 @@ class Simulator:
             if np.shape(() if value is None else value) != shape:
                 raise ArgumentError(f"{name} has shape {np.shape(value)}, not {shape}")
         self._checked_particles(state.x)
+        with np.errstate(over="ignore"):
+            packed = self._particles.pack(state)
+        if not np.isfinite(packed).all():
+            for name in ("v", "C", "F"):
+                require_finite(name, self._real(getattr(state, name)), "particle")
+        poses = np.array(state.poses, np.float64)
+        require_finite("poses", poses, "manipulator")
+        held = None if state.joints is None else np.array(state.joints, np.float64)
+        if held is not None:
+            require_finite("joints", held, "joint")
         self._version += 1
-        self._particles.current.from_numpy(self._particles.pack(state))
+        self._particles.current.from_numpy(packed)
         self._particles.reset_order()
-        self._joints = None if state.joints is None else np.array(state.joints, np.float64)
+        self._joints = held
         self._take_impulses(clear=True)
-        self._place(np.asarray(state.poses, np.float64))
+        self._place(poses)
 
     def initial_state(self) -> State:
         """Return the initial state of :meth:`reset` and :meth:`rollout`."""
@@ -755,7 +769,8 @@ class Simulator:
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
         given = map(sample_particles, scenes) if particles is None else particles
-        return [self._checked_particles(x) for x in given]
+        names = [f"particles[{e}]" if self.batch > 1 else "particles" for e in range(self.batch)]
+        return [self._checked_particles(*pair) for pair in zip(given, names, strict=True)]
 
     def _start_from(self, positions: Sequence[np.ndarray]) -> None:
         self._particles.start_order(positions)
@@ -772,8 +787,13 @@ class Simulator:
         self._map = chain.action_map(self.scenes) if chain else None
         self._initial_joints = self._map.start if self._map else None
 
-    def _checked_particles(self, x: ArrayLike) -> np.ndarray:
-        return checked_positions(x, self.particle_count, self.grid_size)
+    def _checked_particles(self, x: ArrayLike, label: str = "particles") -> np.ndarray:
+        return checked_positions(x, self.particle_count, self.grid_size, label)
+
+    def _real(self, values: ArrayLike) -> np.ndarray:
+        """Convert to the simulation's precision; numbers beyond its range become infinite."""
+        with np.errstate(over="ignore"):
+            return np.asarray(values, self._numpy_real)
 
     def _place(self, poses: np.ndarray) -> None:
         """Place the manipulators at the start of an episode and clear failures."""
