@@ -1,12 +1,12 @@
-"""Lower bound of the time of an environment step: its memory traffic at the speed of a copy.
+"""Lower bound of the time of an environment step, from its memory traffic and the speed of a copy.
 
     python benchmarks/bound.py task=Move sim.device=cuda --batch 1 64
 
 prints the speed of copies of 1 to 256 MB, and a row per number of environments and kind of call. Each phase
-of a substep has to read and write the state of the particles and the grid nodes that hold mass once; what a
-phase reads again is assumed to be in registers or caches. Strain and both scatters are counted again in the
-backward pass. Arithmetic, atomic additions, launches, checkpoints and losses come on top: the ratio of a row
-to the bound shows the share of its time that is not memory's.
+of a substep has to read and write the state of the particles and the grid nodes with mass once; repeated
+reads in a phase are assumed to hit registers or caches. Strain and both scatters are counted again in the
+backward pass. Arithmetic, atomic additions, launches, checkpoints and losses are not included: the ratio of a
+row to the bound shows how much of its time is not memory traffic.
 """
 
 import sys
@@ -26,16 +26,16 @@ from plab.sim.storage import STATE
 COLUMNS = ("batch", "what", "median_ms", "bound_ms", "times_bound")
 
 FOOTPRINTS = tuple(2.0**k * 1e6 for k in (0, 2, 4, 6, 8))
-"""Bytes that a copy touches, both arrays together: caches are faster."""
+"""Bytes touched by a copy, both arrays together; small copies run in caches."""
 
 VECTOR_BYTES = 64
-"""Bytes of the vectors that Taichi is given on the CPU: LLVM makes SIMD operations of them."""
+"""Bytes per vector in Taichi on the CPU, which LLVM compiles to SIMD operations."""
 
 GPU_THREADS = 1 << 18
 """Threads of the copy on CUDA."""
 
 TARGET_S = 0.02
-"""Seconds that a single measurement takes at least."""
+"""Minimum duration of a single measurement [s]."""
 
 REPEATS = 3
 
@@ -45,10 +45,11 @@ NODE = 4
 
 @ti.data_oriented
 class Copy:
-    """A streaming copy by ``workers`` threads, which share the work on the CPU as the simulator's do."""
+    """A streaming copy by ``workers`` threads, which share the work on the CPU as the simulator's threads
+    do."""
 
     def __init__(self, runtime: Runtime) -> None:
-        """Allocate for a runtime in force."""
+        """Allocate for an active runtime."""
         self.cuda = runtime.device == "cuda"
         self.workers = GPU_THREADS if self.cuda else runtime.threads
         # Taichi hands out CPU loops in chunks: one iteration in each does a thread's work.
@@ -75,7 +76,7 @@ class Copy:
                             self.target[i] = self.source[i]
 
     def bytes_per_second(self, footprint: float) -> float:
-        """Bytes read and written per second where both arrays together have so many; the best of runs."""
+        """Bytes read and written per second for a total size of both arrays; the best of several runs."""
         size = int(footprint / 2 / (4 * self.width))
 
         def seconds(passes: int) -> float:
@@ -98,7 +99,7 @@ def bandwidth(device: str) -> tuple[float, ...]:
         device: ``cpu`` or ``cuda``.
 
     Raises:
-        plab.sim.DeviceError: If CUDA was asked for and is not there.
+        plab.sim.DeviceError: If CUDA is requested but not available.
     """
     copy = Copy(start_runtime(device, "float32"))
     return tuple(copy.bytes_per_second(footprint) for footprint in FOOTPRINTS)
@@ -108,7 +109,7 @@ def traffic(load: Workload, gradient: bool) -> list[float]:
     """Return bytes read and written per particle by each phase of a substep, in the workload's initial state.
 
     Args:
-        load: What is timed.
+        load: The timed workload.
         gradient: Whether to add the phases of the backward pass.
     """
     simulator = load.simulator
@@ -129,12 +130,12 @@ def traffic(load: Workload, gradient: bool) -> list[float]:
 
 
 def least_ms(load: Workload, phases: list[float], speeds: tuple[float, ...]) -> float:
-    """Return the least time of an environment step of all environments [ms].
+    """Return the minimum time of an environment step of all environments [ms].
 
     Args:
-        load: What is timed.
-        phases: Bytes per particle, of :func:`traffic`.
-        speeds: Of :func:`bandwidth`.
+        load: The timed workload.
+        phases: Bytes per particle, from :func:`traffic`.
+        speeds: Bandwidths from :func:`bandwidth`.
     """
     simulator = load.simulator
     particles = simulator.batch * simulator.particle_count
@@ -156,7 +157,7 @@ def rows(cfg: Config, batches: Sequence[int], speeds: tuple[float, ...]) -> Iter
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Measure the speed of copies, and calls beside their bounds."""
+    """Measure the speed of copies, and calls with their bounds."""
     parser = Parser("bound", __doc__ or "")
     parser.prog = "python benchmarks/bound.py"
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")

@@ -1,10 +1,10 @@
-"""Time of pictures of a camera in every environment.
+"""Time per camera image in every environment.
 
     python benchmarks/cameras.py                                         one environment, 64 x 64
     python benchmarks/cameras.py sim.device=cuda batch=64 size=128
     python benchmarks/cameras.py sim.device=cuda batch=64 size=128 picture=rgb
 
-Prints milliseconds per frame and frames per second, the simulation left out. The first word may also be any
+Prints milliseconds per frame and frames per second, without the simulation. The first word may also be any
 override of the configuration.
 """
 

@@ -1,10 +1,9 @@
-"""One kind of scene for all tasks of the suite, so that one compiled simulator serves them all.
+"""Common kind of scene for all tasks of the suite, so that one compiled simulator serves them all.
 
-A simulator's environments must have the same manipulators and as many particles. Here every scene has all
-manipulators that any task has, those that its task lacks parked outside the domain and without motion, and
-its bodies share a given number of particles. The physics inside the domain is the task's own; the contact
-term of the loss is not, because the parked manipulators are far from everything: :func:`grid_terms` leave it
-out.
+A simulator's environments must have the same manipulators and numbers of particles. Here every scene has the
+manipulators of all tasks; those that its task lacks are parked outside the domain, without motion. Its bodies
+share a given number of particles. The physics inside the domain is the task's; the contact term of the loss
+is not, because the parked manipulators are far away, so :func:`grid_terms` omits it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from plab.losses.term import Term
 from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 
 PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
-"""Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""
+"""Shapes of the manipulators, in order: for each shape the largest number in any task, and a box."""
 
 PARKED_SIZES = {
     "Sphere": (0.03,),
@@ -37,11 +36,11 @@ def grid_terms() -> tuple[Term, ...]:
 
 
 def common_scene(scene: Scene, particles: int) -> Scene:
-    """Give a scene all manipulators of a common kind of scene, and a number of particles.
+    """Give a scene the manipulators of the common kind of scene, and a number of particles.
 
     Args:
-        scene: A scene with no more manipulators of a shape than there are places for.
-        particles: Particles of all its bodies together, at least as many as there are bodies.
+        scene: A scene with at most as many manipulators of each shape as the common scene.
+        particles: Total number of particles, at least the number of bodies.
 
     Raises:
         plab.scenes.SceneError: If there are too many manipulators or too few particles.
@@ -53,7 +52,7 @@ def common_scene(scene: Scene, particles: int) -> Scene:
 
 
 def common_actions(scene: Scene, actions: np.ndarray) -> np.ndarray:
-    """Turn a scene's actions into those of its :func:`common_scene`.
+    """Convert a scene's actions to those of its :func:`common_scene`.
 
     Args:
         scene: The scene.
@@ -75,7 +74,7 @@ def own_components(scene: Scene) -> list[int]:
 
 
 def _places(scene: Scene) -> list[int]:
-    """Return the place of each of the scene's manipulators."""
+    """Return the index of each of the scene's manipulators in the common scene."""
     free = list(range(len(PLACES)))
     taken = []
     for manipulator in scene.manipulators:
@@ -101,7 +100,7 @@ def _parked(shape: str) -> Manipulator:
 
 
 def _shared(bodies: tuple[Body, ...], particles: int) -> tuple[Body, ...]:
-    """Return the bodies with a number of particles shared out in proportion to what they had."""
+    """Return the bodies with a number of particles distributed in proportion to their previous numbers."""
     if particles < len(bodies):
         raise SceneError(f"{particles} particles are too few for {len(bodies)} bodies")
     had = np.array([body.particles for body in bodies], dtype=float)

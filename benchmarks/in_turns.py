@@ -1,7 +1,8 @@
-"""Two or more checkouts of plab, timed in turns: ``python benchmarks/in_turns.py ../before . batch=1,8``.
+"""Alternating timing of two or more checkouts of plab: ``python benchmarks/in_turns.py ../before .
+batch=1,8``.
 
-Each checkout runs in a process of its own. They are asked for one call each, in an order drawn anew every
-round, so that what else the computer does meets all of them alike; the ratio is the median over the rounds.
+Each checkout runs in a separate process and executes one call per round, in random order, so that other load
+on the computer affects all of them equally; the ratio is the median over the rounds.
 
 Words: ``batch=1,64`` (environments), ``kind=forward,gradient``, ``rounds=40``, ``threads=2``; all others are
 overrides of the configuration, such as ``task=Rope sim.device=cuda``.
@@ -20,7 +21,7 @@ from pathlib import Path
 STEPS = 10
 
 KINDS = {"forward": "forward", "gradient": "forward + backward"}
-"""What can be timed, by the names of :data:`plab.bench.workload.KINDS`."""
+"""Timed calls, by the names of :data:`plab.bench.workload.KINDS`."""
 
 
 def serve(kind: str, batch: str, overrides: list[str]) -> None:

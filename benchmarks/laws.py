@@ -1,11 +1,11 @@
-"""Constitutive laws against theory and experiments: collapses, slopes, slumps, viscosity, pressure.
+"""Constitutive laws compared with theory and experiments: collapses, slopes, slumps, viscosity, pressure.
 
     python benchmarks/laws.py
     python benchmarks/laws.py swirl slump
 
-prints a line per case and resolution: a number of the simulation and what theory or experiments say. Bodies
-stand in a corner of the domain, whose walls are planes of symmetry; slabs and columns have walls without
-friction. A time step is 0.8 of the largest stable one.
+prints a line per case and resolution: the simulated value and the value from theory or experiments. Bodies
+stand in a corner of the domain, whose walls are planes of symmetry; slabs and columns have frictionless
+walls. The time step is 0.8 times the largest stable one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SUBSTEPS = 20
 """Substeps per environment step."""
 
 WALL = 2
-"""The node [cells] at which walls and floor are felt: bodies begin there."""
+"""Position of walls and floor [cells], where bodies begin."""
 
 PARTICLES = 2
 """Particles per cell and axis."""
@@ -38,7 +38,7 @@ THICKNESS = 4
 """Thickness of a slab [cells]."""
 
 Row = tuple[str, float, float]
-"""Quantity, its value, and what theory or experiments say."""
+"""Quantity, simulated value, and value from theory or experiments."""
 
 
 def lattice(x: int, y: int, z: int) -> np.ndarray:
@@ -48,7 +48,7 @@ def lattice(x: int, y: int, z: int) -> np.ndarray:
 
 
 def cylinder(radius: int, height: int) -> np.ndarray:
-    """Particles of a quarter of a cylinder about the axis y [cells], shape [particle, 3]."""
+    """Particles of a quarter of a cylinder about the y axis [cells], shape [particle, 3]."""
     box = lattice(radius, height, radius)
     return box[np.hypot(box[:, 0], box[:, 2]) < radius]
 
@@ -56,16 +56,16 @@ def cylinder(radius: int, height: int) -> np.ndarray:
 SAND = {"poisson_ratio": 0.2, "friction_angle": 25.0}
 
 FRICTION = 2.0 * math.sqrt(3.0) * math.sin(math.radians(25.0)) / (3.0 - math.sin(math.radians(25.0)))
-"""Shear stress over pressure of this sand in simple shear: the tangent of 29.6 degrees."""
+"""Ratio of shear stress to pressure of this sand in simple shear: the tangent of 29.6 degrees."""
 
 
 class Run:
-    """A body of one law in a corner of the domain, or a slab or column of it between walls.
+    """A body with one law in a corner of the domain, or a slab or column of it between walls.
 
     Attributes:
-        scene: Its scene.
-        simulator: Its simulator.
-        time: Time [s].
+        scene: The scene.
+        simulator: The simulator.
+        time: Current time [s].
     """
 
     def __init__(self, law: str, values: dict[str, float], x: np.ndarray, grid: int, **scene: Any) -> None:
@@ -116,8 +116,8 @@ class Run:
 
 
 def collapse(radius: int) -> Iterator[Row]:
-    """A column of sand as high as its radius collapses: Lube et al. (2004), grains that rest at 30 degrees;
-    height of glass beads after Lajeunesse et al. (2004)."""
+    """Collapse of a sand column with height equal to radius: run-out after Lube et al. (2004), grains with a
+    repose angle of 30 degrees; height of glass beads after Lajeunesse et al. (2004)."""
     values = {**SAND, "youngs_modulus": 200.0 * GRAVITY / 4.0}
     run = Run("drucker_prager", values, cylinder(radius, radius), 4 * radius)
     run.go(4.5 * math.sqrt(0.25 / GRAVITY))
@@ -130,7 +130,7 @@ def collapse(radius: int) -> Iterator[Row]:
 
 
 def slope(cells: int) -> Iterator[Row]:
-    """A layer of sand on a rough, tilted floor: its top's acceleration, and g (sin beta - mu cos beta)."""
+    """Acceleration of a layer of sand on a rough, tilted floor, compared with g (sin beta - mu cos beta)."""
     for tilt in (25.0, 36.0):
         sine, cosine = math.sin(math.radians(tilt)), math.cos(math.radians(tilt))
         values = {**SAND, "youngs_modulus": 500.0 * GRAVITY / 18.0}
@@ -145,7 +145,7 @@ def slope(cells: int) -> Iterator[Row]:
 
 
 def swirl(radius: int) -> Iterator[Row]:
-    """A free cylinder of fluid turns as J1(k r) with k R = 5.1356: its rate of decay is eta k^2."""
+    """Decay rate of the swirl J1(k r), k R = 5.1356, in a free cylinder of fluid, compared with eta k^2."""
     k = jn_zeros(2, 1)[0] / radius
     signs = np.array([[1, 1, 1], [-1, 1, 1], [1, 1, -1], [-1, 1, -1]])
     x = np.concatenate([cylinder(radius, radius) * sign for sign in signs])
@@ -162,7 +162,7 @@ def swirl(radius: int) -> Iterator[Row]:
 
 
 def layer(height: int) -> Iterator[Row]:
-    """A layer of fluid at rest: the gradient of its pressure is rho g."""
+    """Pressure gradient in a layer of fluid at rest, compared with rho g."""
     grid = height + 8
     values = {"bulk_modulus": 500.0 * GRAVITY, "viscosity": 0.1}
     run = Run("fluid", values, lattice(THICKNESS, height, THICKNESS), grid)
@@ -178,7 +178,7 @@ def layer(height: int) -> Iterator[Row]:
 
 
 def dam(width: int) -> Iterator[Row]:
-    """A dam twice as high as wide breaks: place of the front, after Martin and Moyce (1952)."""
+    """Position of the front after the break of a dam twice as high as wide, after Martin and Moyce (1952)."""
     edge = 1.0 / 6.0
     values = {"bulk_modulus": 400.0 * GRAVITY * edge, "viscosity": 1e-4}
     run = Run("fluid", values, lattice(width, 2 * width, THICKNESS), 6 * width, floor_friction=0.0)
@@ -192,7 +192,7 @@ def dam(width: int) -> Iterator[Row]:
 
 
 def slump(height: int) -> Iterator[Row]:
-    """A cylinder of a Bingham body, as high as its radius, slumps: Pashias et al. (1996)."""
+    """Slump of a Bingham cylinder with height equal to radius, after Pashias et al. (1996)."""
     weight = GRAVITY / 4.0
     for share in (0.6, 0.2, 0.1):
         flow = {"yield_stress": math.sqrt(2.0) * share * weight, "consistency": 0.002 * weight}

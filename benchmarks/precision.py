@@ -1,12 +1,13 @@
-"""float32 against float64 on the fifty configurations: demonstrations and random actions.
+"""Comparison of float32 with float64 on the fifty configurations: demonstrations and random actions.
 
     python benchmarks/precision.py --csv precision.csv --markdown precision.md
-    python benchmarks/precision.py --particles 10000                     # as many as the tasks have
-    python benchmarks/precision.py --device cuda --deterministic         # float32 whose sums are of integers
+    python benchmarks/precision.py --particles 10000                     # as in the tasks
+    python benchmarks/precision.py --device cuda --deterministic         # float32 with integer sums
 
-prints a row per configuration and kind of actions: the score in both precisions in the hard contact model,
-and how far apart the gradients of the trajectory loss are in the soft one, over 50 steps. All configurations
-share one compiled simulator per precision, see ``common_scene.py``; the loss has no contact term.
+prints a row per configuration and kind of actions: the scores in both precisions in the hard contact model,
+and the difference between the gradients of the trajectory loss in the soft one, over 50 steps. All
+configurations share one compiled simulator per precision, see ``common_scene.py``; the loss has no contact
+term.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ class Start:
         task: Task.
         variant: Variant.
         scene: The common scene.
-        particles: Number of particles that the task has.
-        components: Where the task's own action components are.
+        particles: Number of particles in the task.
+        components: Indices of the task's action components.
         actions: Demonstration and random actions, each [T, A'].
     """
 
@@ -64,7 +65,7 @@ class Simulated:
     Attributes:
         x: Final positions in the hard contact model, shape [particle, 3].
         gradient: Gradient in the soft contact model, shape [T, A].
-        failures: What went wrong.
+        failures: Failures by environment.
     """
 
     x: np.ndarray
@@ -93,11 +94,11 @@ def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim
 
     Args:
         configurations: The configurations.
-        targets: A mass tensor for each, or None to make them: what the demonstration ends with.
-        sim: Precision, device and whether sums are deterministic, as :class:`plab.sim.Simulator` takes them.
+        targets: A mass tensor for each; default: the final state of the demonstration.
+        sim: Precision, device and determinism, as arguments of :class:`plab.sim.Simulator`.
 
     Yields:
-        For each configuration its target and a :class:`Simulated` per kind of actions.
+        For each configuration, its target and a :class:`Simulated` per kind of actions.
     """
     simulator = Simulator([configurations[0].scene], terms=grid_terms(), **sim)
     for number, start in enumerate(configurations):
@@ -122,21 +123,23 @@ def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim
 
 
 def mass_of(scene: Scene, x: np.ndarray) -> np.ndarray:
-    """Mass tensor of positions."""
+    """Mass tensor of particle positions."""
     return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor_stencil)
 
 
 def compare(
     configurations: Sequence[Start], device: str = "cpu", deterministic: bool = False
 ) -> Iterator[dict[str, object]]:
-    """Run all in both precisions; yields a row of :data:`COLUMNS` per configuration and kind of actions.
+    """Run all configurations in both precisions; yield a row of :data:`COLUMNS` per configuration and kind of
+    actions.
 
-    The target is what the demonstration ends with in float64: for simulated targets, the task's own.
+    The target is the final state of the demonstration in float64; for simulated targets this is the task's
+    own.
 
     Args:
         configurations: The configurations.
         device: ``cpu`` or ``cuda``, for both.
-        deterministic: Whether sums in float32 are of integers on CUDA, see ``sim.deterministic``.
+        deterministic: Whether float32 sums use integers on CUDA, see ``sim.deterministic``.
     """
     exact = list(run(configurations, None, precision="float64", device=device))
     targets = [target for target, _ in exact]
@@ -171,7 +174,7 @@ def _rows(configurations: Sequence[Start], exact: Sequence, rounded: Iterator) -
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Compare float32 with float64, print, write the files asked for."""
+    """Compare float32 with float64, print rows, and write the requested files."""
     parser = Parser("precision", __doc__)
     parser.prog = "python benchmarks/precision.py"
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
@@ -195,7 +198,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the worst and the median difference of float32 from float64, per task and kind of actions, from
+    """Return the maximum and median difference of float32 from float64, per task and kind of actions, from
     the table of :func:`compare`."""
     score, turn = table["difference"].astype(float).abs(), table["angle_deg"].astype(float)
     groups = table.assign(score=score, turn=turn, failed=table["failures"].fillna("").ne("")).groupby(

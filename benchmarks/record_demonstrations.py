@@ -1,9 +1,9 @@
-"""Record the best known actions of the suite: those that come with plab, or better runs of some results.
+"""Recording of the best known actions of the suite: the bundled ones, or better runs of some results.
 
     python benchmarks/record_demonstrations.py results
     python benchmarks/record_demonstrations.py results --task Move,Rope sim.device=cuda
 
-writes ``<Task>.csv`` and ``scores.csv`` in the folder of ``plab.demonstrations``.
+writes ``<Task>.csv`` and ``scores.csv`` to the folder of ``plab.demonstrations``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["action_names", "best_actions", "best_known", "main", "save_actions"]
 
 def best_actions(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
     """Return the actions of the run with the highest score that has a configuration's scene and target,
-    rounded as they are recorded; None without one, or where a script's actions are the demonstration."""
+    rounded for recording; None without such a run, or if a script's actions are the demonstration."""
     if "seed" in cfg.task.target:
         return None
     names = cfg.task.name, cfg.variant
@@ -46,7 +46,7 @@ def best_actions(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
 
 
 def best_known(cfgs: Sequence[Config], runs: Sequence[Row]) -> list[ReplayedDemonstration]:
-    """Replay known actions and those of runs, and return the better ones of each configuration."""
+    """Replay known actions and those of runs, and return the better ones for each configuration."""
     replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
     found = [best_actions(cfg, runs) for cfg in cfgs]
     if all(actions is None for actions in found):
@@ -56,19 +56,19 @@ def best_known(cfgs: Sequence[Config], runs: Sequence[Row]) -> list[ReplayedDemo
 
 
 def action_names(scene: Scene) -> list[str]:
-    """Name the components of a scene's action vector: number of the manipulator and motion."""
+    """Name the components of a scene's action vector by manipulator number and motion."""
     return list(scene.action_names)
 
 
 def save_actions(task: str, variant: str, actions: np.ndarray, names: list[str], score: float) -> None:
-    """Record a demonstration in place of the one that is there.
+    """Record a demonstration, replacing the existing one.
 
     Args:
         task: Name of the task.
         variant: Name of the variant.
-        actions: Actions in [-1, 1], shape [T, A]; kept to :data:`DECIMALS` decimals.
+        actions: Actions in [-1, 1], shape [T, A]; rounded to :data:`DECIMALS` decimals.
         names: Names of the A components.
-        score: Their score in the hard contact model.
+        score: Score of the actions in the hard contact model.
     """
     table = pd.DataFrame(np.round(actions, DECIMALS) + 0.0, columns=names)
     table.insert(0, "step", np.arange(1, len(table) + 1))
@@ -79,7 +79,7 @@ def save_actions(task: str, variant: str, actions: np.ndarray, names: list[str],
 
 
 def _replace(name: str, rows: pd.DataFrame, keys: list[str]) -> None:
-    """Put rows in place of those of a file that have the same keys."""
+    """Replace the rows of a file that have the same keys."""
     path = demonstrations.FOLDER / name
     if path.is_file():
         old = pd.read_csv(path, dtype={"variant": str})

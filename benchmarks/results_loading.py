@@ -1,10 +1,10 @@
-"""Time and memory of thousands of result files, with and without the index, and from an archive.
+"""Time and memory for loading thousands of result files, with and without the index, and from an archive.
 
     python benchmarks/results_loading.py --runs 10000 --rows 5
     python benchmarks/results_loading.py --runs 1000 --archive
 
-writes that many small result files to a temporary folder and loads them: for the first time, again, after one
-of them has changed. Status, tables and a query follow.
+writes small result files to a temporary folder and loads them: for the first time, again, and after one of
+them has changed. Status, tables and a query follow.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["main", "measure"]
 
 
 def measure(runs: int, rows: int, packed: bool) -> Iterator[dict[str, object]]:
-    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
+    """Write the files and measure; yield a row per loading method, optionally including archives."""
     with tempfile.TemporaryDirectory() as name:
         folder, results, every = Path(name), Path(name) / "results", Selection()
         os.environ["PLAB_CACHE_DIR"] = str(folder / "cache")

@@ -1,14 +1,14 @@
-"""Time of the parts of reinforcement learning, by the number of environments and agents.
+"""Time of the parts of reinforcement learning by number of environments and agents.
 
     python benchmarks/rl.py task=Move --methods ppo sac --envs 1 16
     python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256
     python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
 
-prints a row per method and number of environments: transitions per second, and the milliseconds that each
-part takes per step of all environments; each is waited for before the next one begins. What runs is the
-training of plab.run, an update after every batch of episodes for ppo, in minibatches of the profile's size.
-The transitions per second are those of all agents together and of a training that waits for nothing,
-evaluations and states of checkpoints included, without their files.
+prints a row per method and number of environments: transitions per second, and the milliseconds of each part
+per step of all environments, with synchronisation after each part. The training is that of plab.run, for ppo
+with an update after every batch of episodes, in minibatches of the profile's size. Transitions per second
+count all agents in a training without synchronisation, including evaluations and checkpoint states, but not
+the writing of files.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from plab.sim.compiler import ti
 __all__ = ["COLUMNS", "PARTS", "measure", "rows"]
 
 SIMULATOR_PARTS = (("step", "simulate"), ("measure", "judge"), ("observe", "observe"), ("poses", "observe"))
-"""Methods of the simulator, and the parts that they are of."""
+"""Methods of the simulator, and the parts that they belong to."""
 
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
 """Simulator's step; loss and IoU; observations and their copy from the device; actions; learning."""
@@ -53,26 +53,26 @@ COLUMNS = (
     *("task", "device", "method", "agents", "num_envs", "steps_per_s", *(f"{p}_ms" for p in PARTS)),
     *("evaluate_s", "state_s", "agent_mb"),
 )
-"""Columns of the table: seconds of an evaluation of all, and of making all states; memory per agent, on
-CUDA what torch has at most, on the CPU its replay buffer."""
+"""Columns of the table. ``evaluate_s`` and ``state_s`` cover all agents; ``agent_mb`` is torch's peak on
+CUDA, and the replay buffer on the CPU."""
 
 
 def rows(
     overrides: Sequence[str], trainings: Iterable[tuple[int, int, str]], batches: int
 ) -> Iterator[dict[str, object]]:
-    """Measure batches of trainings, given by the numbers of agents and of environments and the method; yield
-    a row of :data:`COLUMNS` for each."""
+    """Measure training batches for each number of agents and environments and each method; yield a row of
+    :data:`COLUMNS` for each."""
     for agents, num_envs, method in trainings:
         yield measure(_config(overrides, method, num_envs), agents, batches)
 
 
 def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
-    """Train a population for some batches of episodes, twice, and return a row of the table.
+    """Train a population for some batches of episodes, twice; return a row of the table.
 
     Args:
-        cfg: The configuration of each agent but for the seed.
+        cfg: The configuration of each agent except for the seed.
         agents: Number of agents.
-        batches: Batches of episodes to time, after one that compiles the kernels.
+        batches: Number of timed batches of episodes, after one that compiles the kernels.
     """
     method, horizon = cfg.method_as(RlConfig), cfg.sim.horizon
     cfgs = [replace(cfg, seed=seed) for seed in range(agents)]
@@ -121,7 +121,7 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
 
 
 def _seconds(call: Callable[[], object]) -> float:
-    """Return how long a call takes, with the work on CUDA that it only queues."""
+    """Return the duration of a call, including the work that it queues on CUDA."""
     _synchronise()
     start = time.perf_counter()
     call()
@@ -131,7 +131,7 @@ def _seconds(call: Callable[[], object]) -> float:
 
 @contextmanager
 def _timing(parts: Sequence[tuple[Any, str, str]], seconds: dict[str, float]) -> Iterator[None]:
-    """Add up the time spent in methods, given with their owners and the parts that they are of."""
+    """Sum the time spent in methods, given with their owners and parts."""
 
     def timed(call: Callable[..., Any], part: str, *args: Any, **kwargs: Any) -> Any:
         start = time.perf_counter()
@@ -157,7 +157,7 @@ def _synchronise() -> None:
 
 
 def _config(overrides: Sequence[str], method: str, num_envs: int) -> Config:
-    """Return a training in which each batch of episodes is followed by its share of updates."""
+    """Return a training configuration in which each batch of episodes is followed by its updates."""
     cfg = load_config([*overrides, f"method={method}", f"method.num_envs={num_envs}"])
     own = cfg.method_as(RlConfig)
     if isinstance(own, OffPolicyConfig):

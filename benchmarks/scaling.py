@@ -1,9 +1,9 @@
-"""Time of a substep against the number of particles and grid nodes.
+"""Time of a substep by number of particles and grid nodes.
 
     python benchmarks/scaling.py sim.device=cuda --particles 1000 10000 --grids 64 128 --csv scaling.csv
 
-The body stays the same. The time per particle should not grow, and the cost of a finer grid should grow with
-the blocks of 4^3 nodes that hold mass, not with all of them.
+The body stays the same. The time per particle should not increase, and the cost of a finer grid should
+increase with the number of blocks of 4^3 nodes that hold mass, not with the number of all blocks.
 """
 
 import gc
@@ -23,14 +23,14 @@ COLUMNS = (
 )  # fmt: skip
 
 FINEST_DT = 1e-4
-"""Time step at 64 nodes per axis; it shrinks with the cells, for stability."""
+"""Time step at 64 nodes per axis, proportional to the cell size for stability."""
 
 STEPS = 2
 """Environment steps per rollout."""
 
 
 def rows(overrides: Sequence[str], grid: int, particles: int, repeats: int) -> Iterator[dict[str, object]]:
-    """Measure a number of grid nodes per axis and of particles; yield a row per kind of call."""
+    """Measure a number of grid nodes per axis and a number of particles; yield a row per kind of call."""
     gc.collect()
     changes = (f"sim.grid_size={grid}", f"sim.dt={FINEST_DT * min(1.0, 64 / grid)}")
     load = build(with_particles([*overrides, *changes], particles), 1, STEPS, from_start=True)
@@ -62,7 +62,7 @@ def rows(overrides: Sequence[str], grid: int, particles: int, repeats: int) -> I
 
 @command_line
 def main(argv: Sequence[str]) -> None:
-    """Measure all sizes, print, write a CSV file if asked to."""
+    """Measure all sizes, print rows, and write a CSV file on request."""
     parser = Parser("scaling", __doc__ or "")
     parser.prog = "python benchmarks/scaling.py"
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")

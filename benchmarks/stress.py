@@ -1,15 +1,15 @@
-"""Cases that break simulators, and scenes that a simulator must refuse.
+"""Stress test of the simulator: extreme cases, and scenes that the simulator must reject.
 
     python benchmarks/stress.py                         # everything, in both precisions
     python benchmarks/stress.py --quick                 # a few minutes on two cores
     python benchmarks/stress.py --precision float32 --particles 1000 --csv cases.csv
     python benchmarks/stress.py --quick --family "1000 steps" --gradients norms.csv
 
-Beside the suite's configurations, which ``plab bench stability`` has, too: extreme materials, bodies crushed,
-thrown at walls, overlapping, inverted, flat. Cases survive as :mod:`plab.bench.stability` says; scenes that
-cannot be simulated have to be refused with the reason, and come last. All cases of one kind of scene share a
-compiled simulator, see ``common_scene.py``. With ``--gradients`` the norm of the gradient is written for each
-step back in time, and drawn into a PNG of the same name.
+In addition to the suite's configurations, as in ``plab bench stability``, cases have extreme materials, or
+bodies that are crushed, thrown at walls, overlapping, inverted or flat. :mod:`plab.bench.stability` defines
+survival; scenes that cannot be simulated must be rejected with the reason, and come last. All cases with one
+kind of scene share a compiled simulator, see ``common_scene.py``. With ``--gradients`` the norm of the
+gradient at each step back in time is written, and plotted in a PNG of the same name.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DEFORMED = 512
 """Substeps per environment step of bodies that start strongly deformed."""
 
 LABELLED = 12
-"""Largest number of cases for which the figure of norms has a legend: colours repeat."""
+"""Largest number of cases for a legend in the figure of norms, because colours repeat."""
 
 
 BATCH = 12
@@ -78,7 +78,7 @@ class StressCase:
         actions: Actions, shape [T, A].
         contact: Contact model.
         state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
-        contact_weight: Weight of the loss's contact term.
+        contact_weight: Weight of the contact term of the loss.
     """
 
     family: str
@@ -91,8 +91,8 @@ class StressCase:
 
 
 def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
-    """Run cases in a precision, ``float32`` or ``float64``; those of one kind share a compiled simulator.
-    Yield a row of :data:`plab.bench.stability.COLUMNS` per case, and ``norms``."""
+    """Run cases in a precision, ``float32`` or ``float64``; cases with one kind of scene share a compiled
+    simulator. Yield a row of :data:`plab.bench.stability.COLUMNS` per case, and ``norms``."""
     groups: dict[tuple, list[StressCase]] = defaultdict(list)
     for case in cases:
         scene, shapes = case.scene, tuple(m.shape for m in case.scene.manipulators)
@@ -140,13 +140,14 @@ def common_case(
     contact: str,
     **state: np.ndarray,
 ) -> StressCase:
-    """Return a case in the common kind of scene, from a scene and actions of its own."""
+    """Return a case in the common kind of scene, given a scene and its actions."""
     common, actions = common_scene(scene, plan.particles), common_actions(scene, actions)
     return StressCase(family, name, common, actions, contact, state)
 
 
 def suite_actions(plan: StressPlan) -> Iterator[StressCase]:
-    """All configurations under random and bang-bang actions, in both contact models; some for long."""
+    """Return all configurations under random and bang-bang actions, in both contact models; some over the
+    long horizon."""
     short = itertools.product(["suite"], suite_tasks(), plan.variants, ACTIONS, ("soft", "hard"))
     family = f"{plan.long_horizon} steps"
     long = itertools.product([family], plan.long_tasks, ["1"], ACTIONS, ("soft", "hard"))
@@ -165,12 +166,12 @@ def box_scene(*manipulators: Manipulator, center: Vec3 = (0.5, 0.1, 0.5), **chan
 
 
 def sphere(*position: float) -> Manipulator:
-    """Return a ball as the tasks have it, a little faster."""
+    """Return a ball manipulator, slightly faster than in the tasks."""
     return Manipulator("Sphere", (0.04,), vector3(position), scale=(0.03,) * 3)
 
 
 def squeezing(plan: StressPlan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
-    """Two balls at the cube's sides, and actions that press them together and pull them apart again."""
+    """Return two balls at the sides of the cube, and actions that press them together and pull them apart."""
     wave = np.where(np.arange(plan.horizon) % 24 < 12, 1.0, -1.0)
     actions = np.zeros((plan.horizon, 6))
     actions[:, 0], actions[:, 3] = wave, -wave
@@ -178,7 +179,8 @@ def squeezing(plan: StressPlan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
 
 
 def materials(plan: StressPlan) -> Iterator[StressCase]:
-    """Yield stress from none to infinite, Poisson ratio up to what the suite's time step allows, E."""
+    """Return cubes with yield stresses from zero to infinite, Poisson ratios up to the limit of the suite's
+    time step, and extreme E."""
     tools, actions = squeezing(plan)
     for young, nu, flow in itertools.product(
         (50.0, 5000.0), (0.0, 0.2, 0.35), (0.0, 1.0, 50.0, 1e4, math.inf)
@@ -189,7 +191,7 @@ def materials(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def stiff(plan: StressPlan) -> Iterator[StressCase]:
-    """Materials that need all the substeps that they are given: E times 100, and nu up to 0.49."""
+    """Return materials that need all of the given substeps: E times 100, and nu up to 0.49."""
     tools, actions = squeezing(plan)
     substeps = math.ceil(STEP_TIME / replace(box_scene(), youngs_modulus=5e5).stable_dt)
     time_step: dict[str, Any] = {"substeps": substeps, "dt": STEP_TIME / substeps}
@@ -204,12 +206,12 @@ def stiff(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def counted(scene: Scene, particles: int, **changes: Any) -> Scene:
-    """Return a scene of one body with so many particles, and other changes to the body."""
+    """Return a scene with one body with a given number of particles and other changes."""
     return replace(scene, bodies=(replace(scene.bodies[0], particles=particles, **changes),))
 
 
 def crushing(plan: StressPlan) -> Iterator[StressCase]:
-    """Manipulators that crush the cube against the floor or each other, and stay there."""
+    """Return manipulators that crush the cube against the floor or each other, and stay there."""
     lying = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
     thin, six = (0.03,) * 3, np.concatenate([np.eye(3), -np.eye(3)])
     pin = Manipulator("RollingPin", (0.3, 0.04), (0.5, 0.25, 0.5), lying, scale=(0.7, 0.07, 0.01))
@@ -240,7 +242,7 @@ def crushing(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def walls(plan: StressPlan) -> Iterator[StressCase]:
-    """Cubes thrown and pushed into the walls and corners."""
+    """Return cubes thrown and pushed into walls and corners."""
     for number, direction in enumerate(itertools.product((-1.0, 0.0, 1.0), repeat=3)):
         if not any(direction):
             continue
@@ -257,7 +259,7 @@ def walls(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def overlaps(plan: StressPlan) -> Iterator[StressCase]:
-    """Bodies in each other, manipulators in a body, all particles at one point."""
+    """Return overlapping bodies, manipulators inside a body, and all particles at one point."""
     cube = Body("box", (0.5, 0.3, 0.5), (0.2,) * 3, 1000)
     ball = Body("sphere", (0.55, 0.35, 0.5), (0.12,), 1000)
     tools, actions = squeezing(plan)
@@ -284,9 +286,9 @@ def overlaps(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def deformations(plan: StressPlan) -> Iterator[StressCase]:
-    """Initial deformation gradients that are inverted, singular, tiny or huge, with and without flow.
+    """Return initial deformation gradients that are inverted, singular, tiny or huge, with and without flow.
 
-    They store a lot of energy, and the material stiffens while it is let go, hence the substeps.
+    They store a lot of energy, and the material stiffens during release, hence the substeps.
     """
     rng = np.random.default_rng(0)
     turn = np.linalg.qr(rng.normal(size=(plan.particles, 3, 3)))[0]
@@ -311,7 +313,7 @@ def deformations(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def few_particles(plan: StressPlan) -> Iterator[StressCase]:
-    """A single particle, and a handful."""
+    """Return a single particle, and a handful."""
     tools, actions = squeezing(plan)
     for count, flow, contact in itertools.product((1, 5), (50.0, math.inf), ("soft", "hard")):
         scene = counted(box_scene(*tools, yield_stress=flow), count, size=(0.02,) * 3)
@@ -320,7 +322,7 @@ def few_particles(plan: StressPlan) -> Iterator[StressCase]:
 
 
 def refusals() -> dict[str, Scene]:
-    """Scenes that cannot be simulated, by what is wrong with them."""
+    """Return scenes that cannot be simulated, by reason."""
     nan, inf = math.nan, math.inf
     tool = sphere(0.5, 0.3, 0.5)
     scene = box_scene(tool)
@@ -372,7 +374,7 @@ def refusals() -> dict[str, Scene]:
 
 
 def run_refusals() -> Iterator[dict[str, object]]:
-    """Check that scenes that cannot be simulated are refused.
+    """Check that scenes that cannot be simulated are rejected.
 
     Yields:
         A row of :data:`plab.bench.stability.COLUMNS` per scene; ``where`` is the message.
@@ -387,11 +389,11 @@ def run_refusals() -> Iterator[dict[str, object]]:
 
 
 def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
-    """Write, and draw, the norm of the gradient for each step back in time.
+    """Write and plot the norm of the gradient at each step back in time.
 
     Args:
         rows: Rows of :func:`run_cases`.
-        path: CSV file; the drawing is a PNG of the same name.
+        path: CSV file; the plot is a PNG of the same name.
     """
     from plab.report.figures import legend, single, style
 
@@ -421,7 +423,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
 
 @command_line
 def main(argv: Sequence[str]) -> int:
-    """Simulate the cases, print, write the files asked for; return the exit code."""
+    """Simulate the cases, print rows, and write the requested files; return the exit code."""
     parser = Parser("stress", __doc__)
     parser.prog = "python benchmarks/stress.py"
     parser.add_argument(

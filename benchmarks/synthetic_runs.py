@@ -1,4 +1,4 @@
-"""Made-up results: runs with numbers in the right places, for tests and benchmarks of what reads results."""
+"""Synthetic results: runs with plausible numbers, for tests and benchmarks of readers of results."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from plab.results.running import now, provenance
 __all__ = ["SETTLE", "synthetic_run", "template", "write_runs"]
 
 SETTLE = 2.5
-"""Seconds to wait after writing: files that have just changed are not indexed."""
+"""Time to wait after writing [s], because recently changed files are not indexed."""
 
 
 def template(method: str, overrides: list[str] | None = None) -> dict[str, Any]:
-    """Return a configuration of a method, from which :func:`synthetic_run` makes others."""
+    """Return a configuration of a method, from which :func:`synthetic_run` derives others."""
     return config_dict(load_config([f"method={method}", *(overrides or [])]))
 
 
 def synthetic_run(
     config: dict[str, Any], *, rows: int = 5, score: float | None = None, finished: bool = True
 ) -> RunResult:
-    """Return a result with made-up numbers in the right places, fit for :func:`plab.results.write`.
+    """Return a result with synthetic numbers, suitable for :func:`plab.results.write`.
 
     Args:
         config: The configuration; a gradient method's ``iterations`` must be ``rows``.
         rows: Number of iterations, or evaluations.
-        score: Score of the final evaluation; drawn if it is not given.
-        finished: Whether the run has come to its end.
+        score: Score of the final evaluation; default: random.
+        finished: Whether the run has finished.
     """
     rng = np.random.default_rng(int(config_hash(config)[:8], 16))
     method, horizon = config["method"], config["sim"]["horizon"]
@@ -97,7 +97,7 @@ def _provenance(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield configurations of the whole suite, of seed after seed."""
+    """Yield configurations of the whole suite, one seed after another."""
     bases = {method: template(method, [f"results_dir={folder}"]) for method in PAPER_METHODS}
     cells = list(itertools.product(suite_tasks(), SUITE_VARIANTS, PAPER_METHODS))
     for number in range(runs):
@@ -111,11 +111,11 @@ def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def write_runs(runs: int, rows: int, folder: Path) -> None:
-    """Write result files of the whole suite, of seed after seed.
+    """Write result files of the whole suite, one seed after another.
 
     Args:
-        runs: How many.
-        rows: Iterations of each.
+        runs: Number of runs.
+        rows: Number of iterations per run.
         folder: Folder of results.
     """
     for config in _configs(runs, rows, folder):

@@ -28,7 +28,7 @@ SMALL = (
     "sim.dt=4e-4",
     "sim.particles_scale=0.03",
 )
-"""A scene of which a step takes a millisecond."""
+"""Scene in which a step takes a millisecond."""
 
 RUNS = 200
 
@@ -53,7 +53,7 @@ def test_compose(benchmark: BenchmarkFixture) -> None:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of result files, old enough for the database."""
+    """Folder of result files, old enough for the index."""
     folder = tmp_path_factory.mktemp("results")
     write_runs(RUNS, 5, folder)
     time.sleep(SETTLE)
@@ -82,7 +82,7 @@ def still(cfg: Config) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def problem(cfg: Config, still: np.ndarray) -> Problem:
-    """The small scene, compiled."""
+    """Compiled problem of the small scene."""
     problem = Problem([cfg])
     problem.rollout(still, gradient=True)
     return problem

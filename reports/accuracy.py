@@ -55,14 +55,14 @@ if table is not None:
 
 # %%
 def draw_contact_models(runs, series):
-    """Draw the score of each run's best row against that of its final evaluation; None without runs.
+    """Plot the score of each run's best row against that of its final evaluation; None without runs.
 
-    Gradient methods find their actions in the contact model of their rollouts (soft but for Adam-H) and are
-    judged in the hard one.
+    Gradient methods optimise actions in the contact model of their rollouts (soft, except for Adam-H) and are
+    evaluated in the hard one.
 
     Args:
         runs: Our runs.
-        series: Their rows, in the order of ``runs.table``.
+        series: Rows of the runs, in the order of ``runs.table``.
     """
     if runs.table.empty:
         return None

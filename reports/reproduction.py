@@ -64,7 +64,7 @@ for table in agreement(runs):
 
 # %%
 def draw_differences(runs):
-    """Draw the differences per task and method with their intervals; None without any."""
+    """Plot the differences per task and method with their intervals; None without differences."""
     judged = iou_per_task(runs)[-1].data.dropna(subset=["difference"])
     if judged.empty:
         return None

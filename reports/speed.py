@@ -44,7 +44,7 @@ show_table(compared)
 
 # %%
 def draw_step_times(compared):
-    """Draw times per environment step beside the paper's; None without any.
+    """Plot times per environment step next to the paper's; None without any.
 
     Args:
         compared: Data of the table ``timing`` in the form ``comparison``.
@@ -84,7 +84,7 @@ show_figure(drawing)
 
 # %%
 def draw_phases(runs):
-    """Draw how long the phases of the runs took, mean per task and method; None without runs."""
+    """Plot the mean duration of each phase per task and method; None without runs."""
     names = [name for name in PHASES if f"seconds_{name}" in runs.table]
     if runs.table.empty or not names:
         return None

@@ -1,7 +1,7 @@
-"""Generated pages of the site; run by mkdocs-gen-files at build time.
+"""Generation of site pages, run by mkdocs-gen-files at build time.
 
-The reference of the configuration is made from the dataclasses and the YAML files, the reference of Python
-from docstrings. Files of the repository's root, the suite's tasks and the example notebooks get a page each.
+The configuration reference is generated from the dataclasses and the YAML files, the Python reference from
+docstrings. Files in the repository's root, the suite's tasks and the example notebooks get a page each.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def main() -> None:
 
 
 def _notebook(path: Path) -> Iterator[str]:
-    """Yield text, code and outputs of a notebook, with links as the site has them; 3-D views are files."""
+    """Yield text, code and outputs of a notebook, with links as on the site; 3-D views are files."""
     views = itertools.count(1)
     for cell in _executed(path).cells:
         text = cell.source
@@ -149,7 +149,8 @@ def _notebook(path: Path) -> Iterator[str]:
 
 
 def _executed(path: Path) -> nbformat.NotebookNode:
-    """Return a notebook with its outputs, executed in a copy of examples/; kept in build/ by its text."""
+    """Return a notebook with its outputs, executed in a copy of examples/ and cached in build/ by its
+    text."""
     kept = ROOT / "build" / "notebooks" / f"{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}.ipynb"
     if not kept.exists():
         with tempfile.TemporaryDirectory() as folder:
@@ -165,7 +166,7 @@ def _executed(path: Path) -> nbformat.NotebookNode:
 
 
 def _output(output: nbformat.NotebookNode, name: str, views: Iterator[int]) -> Iterator[str]:
-    """Yield an output of a cell as Markdown; progress bars (stderr) are left out."""
+    """Yield an output of a cell as Markdown; progress bars (stderr) are omitted."""
     data = output.get("data", {})
     frame = re.search('<iframe .*srcdoc="([^"]*)"', data.get("text/html", ""))
     number = f"{name}-{next(views)}" if frame or "image/png" in data else ""
@@ -207,7 +208,7 @@ def _configuration() -> Iterator[str]:
 
 
 def _table(kind: type, prefix: str, defaults: dict[str, Any]) -> Iterator[str]:
-    """Yield a table of the keys that a type adds to its bases that have tables of their own."""
+    """Yield a table of the keys that a type adds to those of its bases that have their own tables."""
     described = _described(kind)
     known = {field.name for base in kind.__bases__ if _has_table(base) for field in dataclasses.fields(base)}
     yield "| key | type | default | meaning |"
@@ -240,7 +241,7 @@ def _defaults(source: str | None) -> dict[str, Any]:
 
 
 def _described(kind: type) -> dict[str, str]:
-    """Return what the docstrings of a type and of its bases say about their attributes."""
+    """Return the attribute descriptions from the docstrings of a type and its bases."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         for section in _sections(base):

@@ -1,11 +1,11 @@
-"""Mutation test of the test suite: the tests have to find each of the faults in mutants.yaml.
+"""Mutation test of the test suite: the tests must detect the faults in mutants.yaml.
 
     python tools/mutation.py --log build/mutation.csv          # all faults; takes hours on two cores
     python tools/mutation.py --log build/mutation.csv --only 3,17
 
-A fault is found by a test that fails with it and passes without it. Test files run one process each, those
-first that mention the faulty module most. The log has a row per fault and file; a second call resumes from
-it.
+A fault is detected by a test that fails with it and passes without it. Each test file runs in one process;
+files that mention the faulty module most run first. The log has a row per fault and file, from which a second
+call resumes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HEADER = ("number", "area", "file", "tests", "found_by", "seconds")
 
 
 def mutated_copy(root: Path, to: Path, mutant: dict[str, str]) -> None:
-    """Copy a checkout by hard links and put a fault into it; ValueError unless its text occurs once."""
+    """Copy a checkout by hard links and insert a fault; raise ValueError unless its text occurs once."""
     to.mkdir(parents=True)
     for name in filter(lambda name: (root / name).exists(), COPIED):
         ignore = shutil.ignore_patterns("__pycache__")
@@ -48,7 +48,7 @@ def mutated_copy(root: Path, to: Path, mutant: dict[str, str]) -> None:
 
 
 def by_relevance(root: Path, file: str, first: list[str]) -> list[str]:
-    """Return the test files: those named, then those that mention a module most."""
+    """Return the test files: named ones first, then those that mention a module most."""
     package, stem = Path(file).with_suffix("").parts[-2:]
 
     def mentions(path: Path) -> int:
@@ -63,7 +63,7 @@ def by_relevance(root: Path, file: str, first: list[str]) -> list[str]:
 
 @dataclass
 class Suite:
-    """The tests of a checkout, run a file at a time in processes that stay on a core each."""
+    """Tests of a checkout, run one file at a time in processes pinned to one core each."""
 
     root: Path
     marks: str
@@ -76,7 +76,7 @@ class Suite:
             self.cores.put(core)
 
     def failing(self, folder: Path, tests: str, skipped: list[str]) -> str:
-        """Return the first failing test, the file if that cannot be told, or nothing."""
+        """Return the first failing test, the file if the test is unknown, or nothing."""
         core = self.cores.get()
         path = os.pathsep.join([str(folder / "src"), os.environ.get("PYTHONPATH", "")])
         environment = os.environ | {
@@ -118,7 +118,7 @@ class Suite:
 
 
 def main() -> None:
-    """Try faults, write a row for each fault and test file, and print which faults are found."""
+    """Try faults, write a row for each fault and test file, and print which faults are detected."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--log", type=Path, required=True, help="CSV file, continued if it exists")
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout whose tests are tried")

@@ -1,4 +1,4 @@
-"""Pictures of all tasks in the documentation.
+"""Pictures of all tasks for the documentation.
 
 python tools/sheets.py docs/images/contact_sheet.png     start and target of every task and variant
 python tools/sheets.py docs/images/film_strip.jpg        frames of the best known actions for every task
@@ -21,7 +21,7 @@ from plab.render.rollouts import RecordedRollout, demonstration, record
 
 
 def frames(words: list[str], size: tuple[int, int], count: int) -> tuple[RecordedRollout, list[np.ndarray]]:
-    """Return a demonstration with frames at equal distances in time, or with start and target for one."""
+    """Return a demonstration with frames at equal time intervals, or with initial and target frames only."""
     cfg = load_config(words)
     one = record(cfg, demonstration(cfg))
     x, mass = one.x[[0, -1]].reshape(-1, 3), one.target_mass
@@ -33,7 +33,7 @@ def frames(words: list[str], size: tuple[int, int], count: int) -> tuple[Recorde
 
 
 def main(path: Path) -> None:
-    """Write the contact sheet for a PNG, the film strip for a JPEG."""
+    """Write the contact sheet for a PNG file, the film strip for a JPEG file."""
     require_graphics()
     sheet, tiles = path.suffix == ".png", []
     for task in suite_tasks():

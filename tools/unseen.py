@@ -1,4 +1,4 @@
-"""Figure of scores in unseen scenes in the documentation.
+"""Figure of scores in unseen scenes for the documentation.
 
 python tools/unseen.py docs/images/unseen.png     from src/plab/results/examples/unseen.csv
 """

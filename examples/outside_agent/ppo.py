@@ -1,9 +1,9 @@
-"""PPO for continuous actions in one file, in the style of CleanRL: it knows Gymnasium, NumPy and PyTorch.
+"""PPO for continuous actions in one file, in the style of CleanRL, with Gymnasium, NumPy and PyTorch only.
 
 python examples/outside_agent/ppo.py --env-id plab:plab/Move-v1 --total-steps 20000 --policy move.pt
 
-Two lines are plab's own: the import of ``record``, and its call. They keep the best plan that the agent finds
-within each budget. The deterministic policy at the end is TorchScript, for the other track.
+Two lines are specific to plab: the import of ``record``, and its call. They record the agent's best plan
+within each budget. The final deterministic policy is saved as TorchScript, for the track of policies.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def mlp(inputs, outputs, last_gain):
 
 
 class Scale(nn.Module):
-    """Observations with mean 0 and variance 1, over all that was seen."""
+    """Normalisation of observations to mean 0 and variance 1, over all observations so far."""
 
     def __init__(self, entries):
         super().__init__()
@@ -71,7 +71,8 @@ class Scale(nn.Module):
 
 
 def advantages_of(rewards, values, gamma, lam):
-    """Generalised advantage estimates of one episode; it ends by truncation, so the last value counts."""
+    """Generalised advantage estimates of one episode; it ends by truncation, so the last value is
+    included."""
     deltas = rewards + gamma * values[1:] - values[:-1]
     out, running = torch.zeros_like(deltas), 0.0
     for t in reversed(range(len(deltas))):

@@ -9,7 +9,7 @@ from plab.laws.principal import PrincipalFrame
 
 
 def update(c, f, dt, mu, lam, compression, stretch):
-    """Kirchhoff stress, and F after the substep."""
+    """Return the Kirchhoff stress, and F after the substep."""
     g = trial_gradient(c, f, dt)
     frame = PrincipalFrame(outer_sym(g))
     trial = [np.sqrt(np.maximum(square, 1e-4)) for square in frame.values]

@@ -1,4 +1,4 @@
-"""A term of the loss of one's own, outside plab: mass above a surface.
+"""Custom loss term outside plab: mass above a surface.
 
 plab run --config-dir examples/own_loss/conf method=adam_height task=RollingPin
 """
@@ -12,13 +12,13 @@ __all__ = ["HeightMap"]
 
 
 class HeightMap(NodeTerm):
-    """Sum over the grid of mass times its height above a surface h(x, z), 0 below."""
+    """Sum over the grid of mass times height above a surface h(x, z), 0 below."""
 
     label = "sum over the grid of mass times height above a surface"
     unit = "mass x domain units"
 
     def attach(self, sim) -> None:
-        """Put the surface, a slope that rises along x, onto the device: n x n heights [domain units]."""
+        """Copy the surface, a slope that rises along x, to the device: n x n heights [domain units]."""
         super().attach(sim)
         x = np.arange(sim.n) / sim.n
         heights = np.broadcast_to((0.02 + 0.1 * x)[:, None], (sim.n, sim.n))
@@ -34,10 +34,10 @@ class HeightMap(NodeTerm):
 
     @ti.func
     def measure(self, e, node, mass):
-        """Mass times height."""
+        """Contribution of a node: mass times height."""
         return mass * self.above(node)
 
     @ti.func
     def slope(self, e, node, mass):
-        """Height: the derivative by the mass."""
+        """Derivative with respect to the mass: the height."""
         return self.above(node) + 0.0 * mass

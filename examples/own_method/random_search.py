@@ -1,4 +1,4 @@
-"""A method of one's own, outside plab: random search around the best actions so far.
+"""Custom method outside plab: random search around the best actions so far.
 
 plab run --config-dir examples/own_method/conf method=random_search task=Move
 """
@@ -17,11 +17,11 @@ __all__ = ["FAMILY", "RandomSearch", "RandomSearchConfig"]
 
 @dataclass
 class RandomSearchConfig(MethodConfig):
-    """Keys of random search, beside those of all methods.
+    """Keys of random search, in addition to those of all methods.
 
     Attributes:
-        iterations: Sequences that are tried.
-        spread: Standard deviation of a try around the best one so far.
+        iterations: Number of sampled action sequences.
+        spread: Standard deviation of samples around the best sequence so far.
     """
 
     iterations: int
@@ -37,16 +37,16 @@ class RandomSearchConfig(MethodConfig):
 
 
 class RandomSearch(Runner):
-    """Tries actions around the best ones."""
+    """Random search around the best actions."""
 
     def build(self) -> None:
-        """Make scene, target and simulator."""
+        """Build scene, target and simulator."""
         (track,) = self.tracks
         self.problem = shared_problem(self.cache, [track.cfg])
         self.problem.simulator.set_contact(track.cfg.method.contact, track.cfg.method.softness)
 
     def step(self, track: Track) -> Step:
-        """Try a sequence of actions."""
+        """Evaluate one action sequence."""
         scene, method = self.problem.scenes[0], track.cfg.method_as(RandomSearchConfig)
         best = np.zeros((scene.horizon, scene.action_dim)) if track.iteration == 0 else track.best_actions
         # Drawn from the iteration's own seed, so that a resumed run draws the same numbers.

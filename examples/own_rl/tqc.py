@@ -1,4 +1,4 @@
-"""A learning algorithm of another library, outside plab: truncated quantile critics of SB3-Contrib.
+"""Learning algorithm of another library, outside plab: truncated quantile critics from SB3-Contrib.
 
 plab run --config-dir examples/own_rl/conf method=tqc task=Move
 """
@@ -21,12 +21,12 @@ __all__ = ["FAMILY", "TqcConfig"]
 
 @dataclass
 class TqcConfig(OffPolicyConfig):
-    """Keys of truncated quantile critics, beside those of all methods with a replay buffer.
+    """Keys of truncated quantile critics, in addition to those of all methods with a replay buffer.
 
     Attributes:
         critics: Number of critics.
-        quantiles: Quantiles of the return that each critic predicts.
-        dropped_quantiles: Largest quantiles of each critic that the target leaves out.
+        quantiles: Number of quantiles of the return predicted by each critic.
+        dropped_quantiles: Number of largest quantiles per critic that the target omits.
     """
 
     critics: int

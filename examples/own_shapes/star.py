@@ -1,4 +1,4 @@
-"""A star as a mesh, as a point cloud and as a mass tensor: the files of docs/own_shapes.md."""
+"""A star as a mesh, a point cloud and a mass tensor: the files of docs/own_shapes.md."""
 
 import numpy as np
 

@@ -378,7 +378,7 @@ def solvability(runs: Runs) -> list[Table]:
         "Our targets are generated from parameters or scripts, the paper's are files, so the goals of "
         "the two columns differ slightly. The interval is Student's t over the paper's seeds.",
     ]
-    title = "Demonstrations beside the best method of the paper"
+    title = "Demonstrations and the best method of the paper"
     return [Table("solvability", "comparison", title, cells, data, None, notes, True)]
 
 
