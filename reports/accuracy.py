@@ -27,12 +27,12 @@ import pandas as pd
 
 from plab.report.figures import Drawing, diagrams, legend, single, style
 from plab.report.methods import method
-from plab.report.notebook_cells import benchmark, gather, show_figure, show_origin, show_table
+from plab.report.notebook_cells import benchmark, find_runs, show_figure, show_origin, show_table
 from plab.report.reference import ACCURACY
 from plab.report.statistics import load_series
 from plab.report.tables import number
 
-runs = gather(RESULTS, WORDS)
+runs = find_runs(RESULTS, WORDS)
 show_origin(runs, COMMAND)
 
 # %% [markdown]

@@ -26,7 +26,7 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 # %%
 from plab.report.figures import Drawing, aggregates, legend, rewards, single, style
 from plab.report.methods import method
-from plab.report.notebook_cells import gather, show_figure, show_origin, show_table
+from plab.report.notebook_cells import find_runs, show_figure, show_origin, show_table
 from plab.report.statistics import load_series
 from plab.report.tables import (
     TOLERANCE,
@@ -38,7 +38,7 @@ from plab.report.tables import (
 )
 
 # %%
-runs = gather(RESULTS, WORDS)
+runs = find_runs(RESULTS, WORDS)
 show_origin(runs, COMMAND)
 
 # %% [markdown]

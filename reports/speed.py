@@ -26,11 +26,11 @@ import numpy as np
 
 from plab.report.figures import PHASES, Drawing, grid, legend, single, style
 from plab.report.methods import method
-from plab.report.notebook_cells import benchmark, gather, say, show_figure, show_origin, show_table
+from plab.report.notebook_cells import benchmark, find_runs, show_figure, show_origin, show_table, show_text
 from plab.report.reference import SPEED
 from plab.report.tables import ordered_tasks, timing
 
-runs = gather(RESULTS, WORDS)
+runs = find_runs(RESULTS, WORDS)
 show_origin(runs, COMMAND)
 speed = benchmark(BENCH, SPEED)
 
@@ -113,4 +113,4 @@ show_figure(drawing)
 if len(runs.table):
     total = runs.table["seconds"].sum()
     devices = ", ".join(sorted(set(runs.table["device"])))
-    say(f"All {len(runs.table)} runs together took {total / 60:.1f} minutes on: {devices}.")
+    show_text(f"All {len(runs.table)} runs together took {total / 60:.1f} minutes on: {devices}.")

@@ -201,14 +201,14 @@ def training() -> PodsRunner:
 
 def test_a_round_improves_actions_and_imitates_them(training: PodsRunner, monkeypatch) -> None:
     plans, tried, problem = [], [], training.batch.problem
-    improve, simulate = training._improved, problem.try_out
+    improve, simulate = training._improved, problem.evaluate_actions
 
-    def try_out(actions: np.ndarray, gradient: bool) -> BatchMeasures:
+    def evaluate_actions(actions: np.ndarray, gradient: bool) -> BatchMeasures:
         tried.append(actions)
         return simulate(actions, gradient=gradient)
 
     monkeypatch.setattr(training, "_improved", lambda *args: plans.append(improve(*args)) or plans[-1])
-    monkeypatch.setattr(problem, "try_out", try_out)
+    monkeypatch.setattr(problem, "evaluate_actions", evaluate_actions)
     training.cycle()
     # Begun as the policy's own, and each update of the method's rate at most.
     assert len(tried) == 3
@@ -252,14 +252,14 @@ def test_environments_that_break_off_teach_nothing(
 ) -> None:
     before = [parameter.clone() for parameter in training.network.parameters()]
     batch, learned = training.batch, []
-    try_out, imitate = batch.problem.try_out, training.imitate
+    evaluate_actions, imitate = batch.problem.evaluate_actions, training.imitate
 
     def breaking(actions: np.ndarray, gradient: bool) -> BatchMeasures:
-        trials = try_out(actions, gradient=gradient)
+        trials = evaluate_actions(actions, gradient=gradient)
         trials.gradient[broken] = np.nan
         return replace(trials, failures={e: f"environment {e}: broke off" for e in broken})
 
-    monkeypatch.setattr(batch.problem, "try_out", breaking)
+    monkeypatch.setattr(batch.problem, "evaluate_actions", breaking)
     monkeypatch.setattr(training, "imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
     training.cycle()
     # Each of the three episodes with gradient.

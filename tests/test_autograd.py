@@ -67,13 +67,13 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
     losses = rollout(problem, actions)
     losses.sum().backward()
     assert losses.dtype == actions.grad.dtype == torch.float32
-    wanted, intact = [], Problem.try_out
+    wanted, intact = [], Problem.evaluate_actions
 
-    def try_out(self, tried, *, gradient):
+    def evaluate_actions(self, tried, *, gradient):
         wanted.append(gradient)
         return intact(self, tried, gradient=gradient)
 
-    monkeypatch.setattr(Problem, "try_out", try_out)
+    monkeypatch.setattr(Problem, "evaluate_actions", evaluate_actions)
     assert not rollout(problem, actions.detach()).requires_grad
     with torch.no_grad():
         rollout(problem, actions)
@@ -175,7 +175,7 @@ def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None
 
 def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     actions = draw(9).detach().numpy()
-    before = episodes.problem.try_out(actions, gradient=True)
+    before = episodes.problem.evaluate_actions(actions, gradient=True)
     calls = count()
 
     def react(t: int, bar: np.ndarray | None) -> None:
@@ -185,10 +185,14 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     episodes.reset()
     with pytest.raises(ArithmeticError):
         episodes.closed_loop(HORIZON, lambda t, seen: actions[:, 0], react, discount=0.5)
-    np.testing.assert_array_equal(episodes.problem.try_out(actions, gradient=True).gradient, before.gradient)
+    np.testing.assert_array_equal(
+        episodes.problem.evaluate_actions(actions, gradient=True).gradient, before.gradient
+    )
     episodes.reset()
     policy_gradient(episodes, network(episodes, 6), HORIZON, discount=0.5)
-    np.testing.assert_array_equal(episodes.problem.try_out(actions, gradient=True).gradient, before.gradient)
+    np.testing.assert_array_equal(
+        episodes.problem.evaluate_actions(actions, gradient=True).gradient, before.gradient
+    )
     episodes.reset()
     with pytest.raises(ValueError, match=r"\(2, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)

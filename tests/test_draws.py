@@ -141,7 +141,7 @@ def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() 
     env, seen = TensorEnv(batch), set()
     for _ in range(4):
         observed = env.reset().cpu().numpy()
-        numbers = batch.draws.info()["scene"]
+        numbers = batch.randomizer.info()["scene"]
         seen |= set(numbers.tolist())
         for e, scene in enumerate(batch.problem.scenes):
             drawn = load_config(

@@ -14,7 +14,7 @@ from plab.render.rollouts import RecordedRollout, record_with_motion
 from toy_runner import COARSE
 
 pv = pytest.importorskip("pyvista")
-files = pytest.importorskip("plab.export.files")
+files = pytest.importorskip("plab.export.writers")
 
 
 @pytest.fixture(autouse=True)

@@ -334,15 +334,15 @@ def test_a_resumed_run_keeps_its_best_actions(tmp_path: Path) -> None:
 
 
 def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypatch) -> None:
-    intact, which = Problem.try_out, [1]
+    intact, which = Problem.evaluate_actions, [1]
 
-    def try_out(self, actions, *, gradient):
+    def evaluate_actions(self, actions, *, gradient):
         trials = intact(self, actions, gradient=gradient)
         for values in (*trials.measures.values(), trials.final_loss, *[trials.gradient] * gradient):
             values[which] = np.nan
         return replace(trials, failures=dict.fromkeys(which, "environment step 1: gone"))
 
-    monkeypatch.setattr(Problem, "try_out", try_out)
+    monkeypatch.setattr(Problem, "evaluate_actions", evaluate_actions)
     for method in ("cmaes", "solve"):
         assert faults(run(make_config(tmp_path, method))) == []
     which += [0, 2, 3]

@@ -78,20 +78,20 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:
     """Let agents learn from scripts; return the random numbers that they used, in order."""
     tapes: dict[str, list[Any]] = {"normal": [], "uniform": [], "integers": [], "permutation": []}
-    original = agents.draws.draw
+    original = agents.random.draw
 
     def draw(kind: str, *shape: int) -> torch.Tensor:
         tapes[kind].append(original(kind, *shape))
         return tapes[kind][-1]
 
-    agents.draws.draw = draw
+    agents.random.draw = draw
     play(agents, observations, rewards)
     return tapes
 
 
 def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
     """Let agents learn from scripts, with random numbers one at a time."""
-    agents.draws.block = lambda use, kind, *shape: agents.draws.draw(kind, *shape)
+    agents.random.block = lambda use, kind, *shape: agents.random.draw(kind, *shape)
     told = iter(torch.from_numpy(observations).to(agents.device).unbind(1))
     now = next(told)
     agents.begin(now)
@@ -250,7 +250,7 @@ def test_stacks_on_cuda_learn_what_those_on_the_cpu_learn(name: str) -> None:
     first = [p.detach().clone() for p in agents.parameters()]
     with torch_settings(1):
         played = {kind: deque(drawn) for kind, drawn in taped_and_played(agents, *scripts).items()}
-        others.draws.draw = lambda kind, *shape: played[kind].popleft().cuda()
+        others.random.draw = lambda kind, *shape: played[kind].popleft().cuda()
         play(others, *scripts)
     after = [p.detach().cpu() for p in others.parameters()]
     pairs = list(zip(agents.parameters(), after, strict=True))

@@ -12,7 +12,7 @@ import synthetic
 from plab.bench import accuracy, speed
 from plab.cli.report import main
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
-from plab.report.reference import ACCURACY, SPEED, Benchmark, measured, origin
+from plab.report.reference import ACCURACY, SPEED, Benchmark, origin, read_benchmark
 from plab.results import ResultsError
 from plab.results.examples import measurements
 
@@ -51,7 +51,7 @@ WRITTEN = {ACCURACY: accuracy.COLUMNS, SPEED: speed.PAPER_COLUMNS}
 
 @pytest.mark.parametrize("benchmark", WRITTEN, ids=lambda benchmark: benchmark.file)
 def test_files_of_benchmarks_come_with_plab_and_are_checked(tmp_path: Path, benchmark: Benchmark) -> None:
-    table = measured(measurements("example") / benchmark.file, benchmark)
+    table = read_benchmark(measurements("example") / benchmark.file, benchmark)
     file, command, *_ = origin(table)
     assert file.startswith("Measured: ") and command.startswith(benchmark.command.split(" -")[0])
     assert len(table) == {ACCURACY: len(table)}.get(benchmark, 2 * 10)
@@ -59,7 +59,7 @@ def test_files_of_benchmarks_come_with_plab_and_are_checked(tmp_path: Path, benc
     path = tmp_path / benchmark.file
     path.write_text("task\nMove\n")
     with pytest.raises(ResultsError, match=str(path)):
-        measured(path, benchmark)
+        read_benchmark(path, benchmark)
 
 
 # ------------------------------------------------------------------------------------------------- notebooks
@@ -93,7 +93,7 @@ EXPECTED = {
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("plab.render.graphics.missing_graphics", lambda: "pictures need a painter")
-    speed = measured(measurements("example") / SPEED.file, SPEED)
+    speed = read_benchmark(measurements("example") / SPEED.file, SPEED)
     bench, nothing = tmp_path / "bench", tmp_path / "nothing"
     bench.mkdir(), nothing.mkdir()
     for benchmark, rows in ((ACCURACY, accuracy_rows()), (SPEED, speed)):

@@ -1,4 +1,4 @@
-"""Result tables: equal to reading every file, but faster; SQL, scores and pictures."""
+"""Result tables: equality with reading every file, speed of the index, SQL, scores and pictures."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from plab.results import RunFile, read
 from plab.results.running import acquire
 from plab.runners.runner import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
-from plab.sweep.running import compose_jobs, look_up, plan
+from plab.sweep.running import compose_jobs, plan, stored_outcome
 from same_runs import raising
 from toy_runner import COARSE, WHY, assert_complete, computed, configs
 
@@ -166,7 +166,7 @@ def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
     run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(begun)}, keep=True)
     run.release()
     lock = acquire(busy.path)
-    ends = [look_up(cfg) for cfg in (finished, failed, begun, absent, busy)]
+    ends = [stored_outcome(cfg) for cfg in (finished, failed, begun, absent, busy)]
     assert [one.status for one in ends] == ["finished", "failed", "lost", "lost", "elsewhere"]
     assert ends[0].score == read(finished.path).evaluation["score"]
     assert ends[1].message == WHY and "1 iterations" in ends[2].message

@@ -44,14 +44,14 @@ def located(place: str, kind: type[PlabError] = ConfigError) -> Iterator[None]:
         raise kind(f"{place}: {error}") from None
 
 
-def pick(name: str, names: Sequence[str]) -> str:
+def suggest(name: str, names: Sequence[str]) -> str:
     """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
     close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
     guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
     return f"{guess}choose from: {', '.join(names)}"
 
 
-def tell(message: str) -> None:
+def print_error(message: str) -> None:
     """Print a line on standard error, for all errors and warnings."""
     with suppress(BrokenPipeError):
         print(f"plab: {' '.join(message.split())}", file=sys.stderr)

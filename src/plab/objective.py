@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.errors import ArgumentError, ConfigError, pick
+from plab.errors import ArgumentError, ConfigError, suggest
 
 TARGET_ENTRIES = 14
 """Length of :func:`target_observation`."""
@@ -327,14 +327,14 @@ def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None 
     chosen = _DEFAULT_TERMS | dict(choices or {})
     for name in choices or {}:
         if name not in weights:
-            raise ConfigError(f"method.loss_terms.{name} has no weight; {pick(name, list(weights))}")
+            raise ConfigError(f"method.loss_terms.{name} has no weight; {suggest(name, list(weights))}")
     classes = {}
     for name in weights:
         term = chosen.get(name, name)
         if term not in TERMS and ":" not in term:
             raise ConfigError(
-                f"method.loss_weights.{name}: there is no term '{term}'; {pick(term, list(TERMS))}, or set "
-                f"method.loss_terms.{name}=module:Class"
+                f"method.loss_weights.{name}: there is no term '{term}'; {suggest(term, list(TERMS))}, or "
+                f"set method.loss_terms.{name}=module:Class"
             )
         classes[name] = TERMS.get(term, term)
     return classes

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError, suggest
 
 Kind = TypeVar("Kind")
 
@@ -58,7 +58,7 @@ class Registry(UserDict[str, Any]):
         if ":" in name:
             return load_object(name, self._kind)
         if name not in self:
-            raise ConfigError(f"{key} '{name}' does not exist; {pick(name, [*self, 'module:NAME'])}")
+            raise ConfigError(f"{key} '{name}' does not exist; {suggest(name, [*self, 'module:NAME'])}")
         return self[name]
 
 

@@ -100,7 +100,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Return True if a scene and its target fit into the grid's domain, smaller for coarse grids."""
+    """Return True if a scene and its target fit into the domain, which is smaller for coarse grids."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):
@@ -213,7 +213,7 @@ class Problem:
         self.initial_scores = [judged[kind] for kind in kinds]
         self._rescale()
 
-    def vary(
+    def set_episode_starts(
         self,
         scenes: Sequence[Scene],
         particles: Mapping[int, np.ndarray],
@@ -293,7 +293,7 @@ class Problem:
             "score": float(self.scores_of(iou)[0][0]),
         }
 
-    def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
+    def evaluate_actions(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
         """Return the measures of episodes simulated as in :meth:`rollout`, without an error for divergence.
         CUDA tensors stay on the device, except failures."""
         result = self.simulator.rollout(actions, gradient=gradient, strict=False)

@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Sequence
 
 from plab.cli.command import command_line
-from plab.errors import ArgumentError, pick
+from plab.errors import ArgumentError, suggest
 
 BENCHMARKS = ("speed", "accuracy", "stability", "unseen")
 
@@ -19,5 +19,5 @@ def main(argv: Sequence[str]) -> int:
         print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has its own --help")
         return 0
     if name not in BENCHMARKS:
-        raise ArgumentError(f"unknown benchmark {name}; {pick(name, BENCHMARKS)}")
+        raise ArgumentError(f"unknown benchmark {name}; {suggest(name, BENCHMARKS)}")
     return int(importlib.import_module(f"plab.bench.{name}").main(rest))

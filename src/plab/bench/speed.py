@@ -22,7 +22,7 @@ from plab.cli.command import Parser, command_line, measure_table, positive, to_w
 from plab.config import Config, load_config
 from plab.config.overrides import parse, prepared
 from plab.config.suite import suite_tasks
-from plab.errors import tell
+from plab.errors import print_error
 from plab.progress import show_line
 from plab.report.reference import paper_table
 from plab.sweep.running import jobs_of
@@ -65,7 +65,7 @@ def rows(
         try:
             first_s, (median, least, most) = time_calls(load, kind, repeats)
         except MemoryError as error:
-            tell(f"not measured: {kind}, {batch} environment(s): {error}")
+            print_error(f"not measured: {kind}, {batch} environment(s): {error}")
             continue
         updates = batch * simulator.particle_count * simulator.substeps
         yield {

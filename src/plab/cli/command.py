@@ -22,7 +22,15 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from plab.config.selection import one_protocol, select
 from plab.config.suite import EXTENSION_TASKS, suite_tasks
-from plab.errors import TRACEBACK, ArgumentError, PlabError, out_of_memory, pick, tell, traceback_wanted
+from plab.errors import (
+    TRACEBACK,
+    ArgumentError,
+    PlabError,
+    out_of_memory,
+    print_error,
+    suggest,
+    traceback_wanted,
+)
 
 if TYPE_CHECKING:
     from plab.results import Row
@@ -61,22 +69,22 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         except BrokenPipeError:
             return _close_output()
         except PlabError as error:
-            tell(str(error))
+            print_error(str(error))
             return error.exit_code
         except OSError as error:
             reason = error.strerror or str(error)
-            tell(reason if error.filename is None else f"cannot write {error.filename}: {reason}")
+            print_error(reason if error.filename is None else f"cannot write {error.filename}: {reason}")
         except MemoryError as error:
-            tell(out_of_memory(error))
+            print_error(out_of_memory(error))
         except KeyboardInterrupt as error:
-            tell(": ".join(["stopped", *map(str, error.args)]))
+            print_error(": ".join(["stopped", *map(str, error.args)]))
             return EXIT_INTERRUPTED
         except Exception as error:
             if traceback_wanted():
                 raise
             last = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}"
-            tell(f"a bug: {where}: {error}; please report it with the output of {TRACEBACK}=1")
+            print_error(f"a bug: {where}: {error}; please report it with the output of {TRACEBACK}=1")
             return EXIT_BUG
         return PlabError.exit_code
 
@@ -109,7 +117,7 @@ class Parser(ArgumentParser):
         unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
         flags = [flag for action in self._actions for flag in action.option_strings if flag[:2] == "--"]
         if unknown.startswith("-"):
-            message = f"unknown flag {unknown}; {pick(unknown, flags)}"
+            message = f"unknown flag {unknown}; {suggest(unknown, flags)}"
         raise ArgumentError(message)
 
 
@@ -158,7 +166,8 @@ def sources_and_words(
 
 
 def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
-    """Return the finished runs that match selections; raise ResultsError for none or mixed protocols."""
+    """Return the finished runs of one protocol that match selections; raise ResultsError if there are
+    none."""
     from plab.results.run_file import NAMES, ResultsError
     from plab.results.table import rows
 

@@ -33,7 +33,7 @@ from plab.demonstrations import known_actions
 from plab.demonstrations.minari import DatasetError, Episode, write_dataset
 from plab.envs.core import EpisodeBatch
 from plab.envs.observations import mapped, spaces
-from plab.errors import ArgumentError, tell
+from plab.errors import ArgumentError, print_error
 from plab.problem import build_scenes, fits
 from plab.results import read
 from plab.scenes import Camera
@@ -151,11 +151,11 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
 
 def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
     """Execute runs, and return the best actions of those that have not failed."""
-    from plab.sweep.running import carry_here, run_batches
+    from plab.sweep.running import execute_batches, run_batches
 
-    for one in run_batches(cfgs, carry_here, together):
+    for one in run_batches(cfgs, execute_batches, together):
         if not one.finished:
-            tell(f"{one.title}: {one.message}")
+            print_error(f"{one.title}: {one.message}")
     done = [(cfg, read(cfg.path).best_actions) for cfg in cfgs if cfg.path.is_file()]
     if not done:
         raise DatasetError("no run has finished")
@@ -236,7 +236,7 @@ class _Recorder:
             failures = dict(step.failures)
         for e, one in enumerate(part):
             if e in failures:
-                tell(f"{one.cfg.task.name}-v{one.cfg.variant}: left out: {failures[e]}")
+                print_error(f"{one.cfg.task.name}-v{one.cfg.variant}: left out: {failures[e]}")
                 continue
             named = {"task": one.cfg.task.name, "variant": one.cfg.variant, "source": one.source}
             measured = {key: np.array([info[key][e] for info in infos]) for key in ("loss", "iou", "score")}

@@ -22,7 +22,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from plab.errors import PlabError, pick, tell
+from plab.errors import PlabError, print_error, suggest
 
 COMMANDS = {
     "run": "plab.cli.run:main",
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print((__doc__ or "").partition("\n\n")[2].rstrip())
         return 0
     if name not in COMMANDS:
-        tell(f"unknown command {name}; {pick(name, list(COMMANDS))}")
+        print_error(f"unknown command {name}; {suggest(name, list(COMMANDS))}")
         return PlabError.exit_code
     module, _, function = COMMANDS[name].partition(":")
     return int(getattr(importlib.import_module(module), function)(rest))

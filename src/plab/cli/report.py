@@ -16,13 +16,13 @@ from pathlib import Path
 
 from plab.cli.command import Parser, add_sources, command_line, folder, sources_and_words
 from plab.config.selection import select
-from plab.errors import tell
+from plab.errors import print_error
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.notebooks import NOTEBOOKS, execute
 from plab.report.page import Page
-from plab.report.reference import SPEED, measured
+from plab.report.reference import SPEED, read_benchmark
 from plab.report.writing import write_curves, write_tables
 from plab.results import ResultsError
 from plab.results.examples import EXAMPLES, measurements, resolve
@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> None:
     out = options.out or Path("reports") / options.what
     command = shlex.join(["plab", "report", *argv])
     if options.what == "tables":
-        benchmark = None if options.speed is None else measured(options.speed, SPEED)
+        benchmark = None if options.speed is None else read_benchmark(options.speed, SPEED)
         made = f"{len(write_tables(runs, out, command, benchmark))} tables"
     elif options.what == "curves":
         made = f"{len(write_curves(runs, out, command))} figures"
@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> None:
         made = _make_page(runs, options, out, command)
     print(f"{out}: {made} of {len(runs.table)} out of {runs.expected} runs")
     for line in runs.left_out:
-        tell(line)
+        print_error(line)
 
 
 def _make_notebooks(options: argparse.Namespace, out: Path, command: str) -> str:
@@ -92,7 +92,7 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
 
             draw_runs(wanted, page.write)
         except RenderError as error:
-            tell(f"without pictures: {error}")
+            print_error(f"without pictures: {error}")
         finally:
             page.write()
     return "index.html"

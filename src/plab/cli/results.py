@@ -25,7 +25,7 @@ from plab.cli.command import (
     sources_and_words,
 )
 from plab.config.selection import require_possible, select
-from plab.errors import tell
+from plab.errors import print_error
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.run_file import ResultsError
@@ -134,4 +134,4 @@ def _names(text: str) -> list[str]:
 
 def _report_skipped(unreadable: Iterable[ResultsError]) -> None:
     for error in unreadable:
-        tell(f"left out: {error}")
+        print_error(f"left out: {error}")

@@ -149,7 +149,7 @@ def export(argv: Sequence[str]) -> None:
     if output.is_dir() and any(output.iterdir()):
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
-    from plab.export.files import write_ply, write_vtk
+    from plab.export.writers import write_ply, write_vtk
     from plab.files import complete_folder
     from plab.render.rollouts import record_with_motion
 

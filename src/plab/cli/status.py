@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
         print(look().groups.to_csv(index=False), end="")
     else:
         # Imported here, because scripts need no tables.
-        from plab.status.view import show, watch
+        from plab.status.display import show, watch
 
         if options.form == "watch":
             watch(look)

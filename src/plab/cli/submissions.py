@@ -11,7 +11,7 @@ import plab
 from plab.cli.command import Parser, command_line, folder, positive, print_table, sources_and_words, to_write
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.errors import PlabError, tell
+from plab.errors import PlabError, print_error
 from plab.report.page import asset, render
 from plab.report.statistics import BUDGETS
 from plab.results.run_file import replace_file
@@ -128,7 +128,7 @@ def verify(argv: Sequence[str]) -> int:
             verdicts = simulate_again(submission, words, run_policies=options.run_policies)
         except PlabError as error:
             # An invalid file does not prevent the verification of others.
-            tell(str(error))
+            print_error(str(error))
             codes.append(error.exit_code)
             continue
         rows = [
@@ -138,7 +138,7 @@ def verify(argv: Sequence[str]) -> int:
         print_table(("configuration", "steps", "claimed", "score", "outcome"), rows)
         # One line suffices for policies that were not run.
         for why in dict.fromkeys(one.why for one in verdicts if one.why):
-            tell(f"{path}: {why}")
+            print_error(f"{path}: {why}")
         kept = write_verification(verdicts, submission, words)
         good = sum(one.outcome == HOLDS for one in verdicts)
         print(f"{path}: {good} of {len(verdicts)} claim(s) hold; written to {kept}")
@@ -184,5 +184,5 @@ def leaderboard(argv: Sequence[str]) -> None:
     path = options.out / "index.html"
     replace_file(path, html)
     for line in left_out:
-        tell(f"left out: {line}")
+        print_error(f"left out: {line}")
     print(f"{path}: {sum(len(section['lines']) for section in sections)} lines")

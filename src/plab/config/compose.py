@@ -30,7 +30,7 @@ from plab.config.families import family
 from plab.config.overrides import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError, suggest
 from plab.plugins import search_in
 from plab.scenes import MATERIAL_KEYS, Scene, vector3
 from plab.targets import check_target, load_release_target
@@ -158,7 +158,7 @@ def hydra_app() -> Hydra:
 
 
 def _sets_a_value(override: Override) -> bool:
-    """Return whether an override is ``key=value`` without sweep, file selection or prefix."""
+    """Return whether an override sets one value, without sweep, file selection or prefix."""
     group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
     other = group or override.is_sweep_override() or override.is_hydra_override()
     return override.type is OverrideType.CHANGE and not other
@@ -255,7 +255,7 @@ def build_scene(cfg: Config) -> Scene:
     """
     task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
     if cfg.variant not in task.variants:
-        advice = pick(cfg.variant, list(task.variants))
+        advice = suggest(cfg.variant, list(task.variants))
         raise ConfigError(f"variant {cfg.variant} of task {task.name} does not exist; {advice}")
     scene = Scene(
         bodies=task.build_bodies(sim.particles_scale),
@@ -404,5 +404,5 @@ def _reject_unknown(node: Any, path: str) -> None:
     known = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else None
     for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
         if known is not None and key not in known:
-            raise ConfigError(f"unknown key '{path}{key}'; {pick(key, known)}")
+            raise ConfigError(f"unknown key '{path}{key}'; {suggest(key, known)}")
         _reject_unknown(below, f"{path}{key}.")

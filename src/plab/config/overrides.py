@@ -15,7 +15,7 @@ from yaml import MarkedYAMLError, YAMLError
 
 from plab.config.selection import leaves
 from plab.config.suite import EXTENSION_TASKS
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError, suggest
 
 RANDOM = "random"
 """Name of the random variant."""
@@ -96,7 +96,7 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
     does not exist."""
     if name not in task.variants:
         names = [*task.variants, *([RANDOM] if task.random else [])]
-        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
+        advice = suggest(name, names) if names else 'add variants: {"1": {}} to the task'
         raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
     changes = task.variants[name]
     if not isinstance(changes, DictConfig):
@@ -117,7 +117,7 @@ def explain(error: Exception) -> str:
         return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return f"{group} '{name}' does not exist; {pick(name, error.options)}"
+        return f"{group} '{name}' does not exist; {suggest(name, error.options)}"
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: {error.problem}"
@@ -155,4 +155,4 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     deeper = [path for path, _ in below if path.rpartition(".")[2] == last and not path.startswith("hydra.")]
     if deeper:
         return f"unknown key '{key}'; did you mean {' or '.join(deeper[:3])}? choose from: {', '.join(names)}"
-    return f"unknown key '{key}'; {pick(last, names)}"
+    return f"unknown key '{key}'; {suggest(last, names)}"

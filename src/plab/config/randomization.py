@@ -26,7 +26,7 @@ from plab.config.overrides import explain, variant_changes
 from plab.config.run import Config
 from plab.config.selection import leaves
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError, suggest
 from plab.scenes import MATERIAL_KEYS, Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
@@ -94,7 +94,7 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
     for name in key.split("."):
         entries = _entries(node)
         if name not in entries:
-            raise ConfigError(f"{path}: task.{key} does not exist; {pick(name, list(entries))}")
+            raise ConfigError(f"{path}: task.{key} does not exist; {suggest(name, list(entries))}")
         node = entries[name]
     if node is None and rest[-1:] and rest[-1] in MATERIAL_KEYS:
         return 0.0

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any, cast
 
-from plab.errors import ConfigError, pick
+from plab.errors import ConfigError, suggest
 
 
 def folder_name(path: str, value: str) -> None:
@@ -19,7 +19,7 @@ def folder_name(path: str, value: str) -> None:
 def one_of(path: str, value: str, names: Sequence[str]) -> None:
     """Raise :class:`ConfigError` unless a value is one of the given names."""
     if value not in names:
-        raise ConfigError(f"{path} '{value}' does not exist; {pick(value, names)}")
+        raise ConfigError(f"{path} '{value}' does not exist; {suggest(value, names)}")
 
 
 def positive(path: str, value: float) -> None:
@@ -30,7 +30,7 @@ def positive(path: str, value: float) -> None:
 
 
 def at_least(path: str, value: float, low: float, *, finite: bool = False) -> None:
-    """Raise :class:`ConfigError` if a value is below ``low``, or not finite where required."""
+    """Raise :class:`ConfigError` if a value is below ``low``, or not finite if required."""
     if not value >= low or (finite and value == math.inf):
         limit = f"{low:g}{' and finite' if finite else ''}"
         raise ConfigError(f"{path} must be at least {limit}, not {value:g}")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from plab.config.suite import SUITE_VARIANTS, group_names
-from plab.errors import ArgumentError, pick
+from plab.errors import ArgumentError, suggest
 
 OBSERVATION_KEYS = ("observe_particles", "observe_target")
 """Configuration keys that determine the entries of observations."""
@@ -101,7 +101,7 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
         for text in texts:
             if text in present or text in known or re.fullmatch(_OPEN.get(name, "(?!)"), text):
                 continue
-            advice = pick(text, sorted({*known, *present})) if known or present else "there are no runs"
+            advice = suggest(text, sorted({*known, *present})) if known or present else "there are no runs"
             raise ArgumentError(f"{name} '{text}' does not exist; {advice}")
     for key in chosen.keys:
         if runs and not any(lookup(run.config, key) == lookup(run.config, key) for run in runs):

@@ -51,7 +51,7 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
 class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, problem: Problem, gradient: bool) -> torch.Tensor:
-        result = problem.try_out(_given(actions, problem.simulator), gradient=gradient)
+        result = problem.evaluate_actions(_given(actions, problem.simulator), gradient=gradient)
         require_none(result.failures)
         if gradient:
             ctx.save_for_backward(torch.as_tensor(result.gradient).to(actions))

@@ -192,7 +192,7 @@ class EpisodeBatch:
         contact: Contact model of the episodes, ``hard`` or ``soft``.
         size: Number of sub-environments.
         horizon: Steps of an episode.
-        draws: Randomisation of the episodes.
+        randomizer: Randomisation of the episodes.
         failures: Diverged environments, with time and reason.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
@@ -255,7 +255,7 @@ class EpisodeBatch:
         self._renderers: list[Renderer] = []
         self.listener: Callable[[Array, Transition], None] | None = None
         self._take(cfgs, problem)
-        state_space, self.action_space = spaces(cfgs[0], [*self.problem.scenes, *self.draws.scenes])
+        state_space, self.action_space = spaces(cfgs[0], [*self.problem.scenes, *self.randomizer.scenes])
         cameras = (cfgs[0].task.cameras or None) if cameras is None else cameras
         points = min(cfgs[0].observe_particles, problem.simulator.particle_count)
         self._sensors = Sensors(observe, cameras, problem.simulator, state_space, points)
@@ -275,7 +275,7 @@ class EpisodeBatch:
         cfgs = self._ranged(cfgs)
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
-        if self.draws.changed or self._stages or kinds_of(cfgs) != kinds_of(self.configs):
+        if self.randomizer.changed or self._stages or kinds_of(cfgs) != kinds_of(self.configs):
             # After an error, the batch is not associated with any configurations.
             self.configs: tuple[Config, ...] = ()
             simulator.set_scenes(scenes)
@@ -285,7 +285,7 @@ class EpisodeBatch:
         self._begin()
 
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
-        """Return configurations, with one object for equal ones, and their ranges."""
+        """Return configurations, sharing one object between equal ones, and their ranges."""
         unique = {id(cfg): cfg for cfg in cfgs}
         for key, cfg in unique.items():
             if self._randomize is not None:
@@ -298,7 +298,7 @@ class EpisodeBatch:
         self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
-        self.draws = EpisodeRandomizer(cfgs, problem)
+        self.randomizer = EpisodeRandomizer(cfgs, problem)
         self._observer = Observer(problem, cfgs[0])
         self._stages = Stages(cfgs, problem) if self._goes_by_stages and any(map(staged, cfgs)) else None
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
@@ -350,7 +350,7 @@ class EpisodeBatch:
 
     def _new_observer(self) -> None:
         # Changes by the caller invalidate the observations of random scenes.
-        known = dict if self.changed_by_hand else self.draws.target_observations
+        known = dict if self.changed_by_hand else self.randomizer.target_observations
         self._observer = Observer(self.problem, self.configs[0], known)
 
     @_alone
@@ -394,7 +394,7 @@ class EpisodeBatch:
                 self._seeds[e], self._episodes[e] = (int(seed),), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = [(*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)]
-        changed = self.draws.randomize_episodes(rows, entropy, options or {})
+        changed = self.randomizer.randomize_episodes(rows, entropy, options or {})
         if self._stages:
             changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers
@@ -403,7 +403,7 @@ class EpisodeBatch:
         self._steps[rows], self._over[rows] = 0, False
         self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
-        if changed or self.draws.changed or environments is not None or on_device(like):
+        if changed or self.randomizer.changed or environments is not None or on_device(like):
             measured = self._measured(like)
             if changed:
                 self._note_starts(rows, *measured[:2])
@@ -427,7 +427,7 @@ class EpisodeBatch:
         self._new_observer()
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
-        """Store observations and measures, arrays or CUDA tensors; some environments keep theirs."""
+        """Store observations and measures, as arrays or CUDA tensors, except for some environments."""
 
         def restore(table: Array, old: Array) -> None:
             own = old[kept]
@@ -517,7 +517,7 @@ class EpisodeBatch:
 
     @_alone
     def get_state(self) -> EpisodeState:
-        """Return a copy of the state for :meth:`set_state`; continuing is bitwise exact on the CPU."""
+        """Return a copy of the state for :meth:`set_state`, bitwise reproducible on the CPU."""
         simulation = self._simulator.state()
         for e in self.failures:
             # Diverged environments are frozen in an arbitrary finite state.
@@ -525,14 +525,14 @@ class EpisodeBatch:
         starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
         episodes = {name: copy.deepcopy(getattr(self, name)) for name in _EPISODES}
         stages = self._stages.saved() if self._stages else ()
-        return EpisodeState(simulation, episodes, tuple(self.draws.values), np.array(starts), stages)
+        return EpisodeState(simulation, episodes, tuple(self.randomizer.values), np.array(starts), stages)
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state returned by :meth:`get_state` of a batch of the same kind; return its observations
         and ``info``. Raise ValueError if a shape is wrong."""
         self._simulator.set_state(state.simulation)
-        changed = self.draws.put(dict(enumerate(state.values)))
+        changed = self.randomizer.put(dict(enumerate(state.values)))
         if self._stages:
             self._stages.restore(state.stages, self.problem)
         if changed or self._stages:
@@ -628,7 +628,7 @@ class EpisodeBatch:
         self._close_renderers()
         self._problem = None
         self._sensors.release()
-        self.draws.release()
+        self.randomizer.release()
 
     def _close_renderers(self) -> None:
         for renderer in self._renderers:
@@ -646,7 +646,7 @@ class EpisodeBatch:
 
     def _noisy(self, observation: Any, steps: np.ndarray) -> Any:
         """Add the sampled noise to observations."""
-        if not (deviations := self.draws.noise()).any():
+        if not (deviations := self.randomizer.noise()).any():
             return observation
         rngs = [
             np.random.default_rng([*seed, int(episode), int(step), 1])
@@ -673,7 +673,7 @@ class EpisodeBatch:
 
     def _info(self, terms: Array, iou: Array, requested: Mapping[str, Array]) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
-        drawn, success = self.draws.info(), score >= self._success_score
+        drawn, success = self.randomizer.info(), score >= self._success_score
         if self._stages:
             success = success & (Constants(self._stages.last).like(iou) > 0.0)
         return {

@@ -164,7 +164,7 @@ class EpisodeRandomizer:
             if target != (self._targets[e] or (self._bases[e], {})):
                 targets[e] = self._target(base, cfg, scenes[e]) if follows else base.target
             self._placed[e], self._targets[e], self.values[e] = place, target, dict(own)
-        problem.vary(scenes, particles, targets)
+        problem.set_episode_starts(scenes, particles, targets)
         return True
 
     def _drawn(self, e: int, seed: Sequence[int], given: Mapping[str, Any]) -> Values:
@@ -283,7 +283,9 @@ class Stages:
         """Set the targets of all sub-environments to the targets of their stages, shape [batch]."""
         rows = np.flatnonzero(stages != self.current)
         if rows.size:
-            problem.vary(problem.scenes, {}, {int(e): self._targets[stages[e]][e] for e in rows})
+            problem.set_episode_starts(
+                problem.scenes, {}, {int(e): self._targets[stages[e]][e] for e in rows}
+            )
         self.current = stages
 
     def begin(self, rows: Sequence[int], problem: Problem) -> bool:

@@ -1,4 +1,4 @@
-"""Rollouts for ParaView and Blender: ``plab export``, and :mod:`plab.export.files` from Python.
+"""Rollouts for ParaView and Blender: ``plab export``, and :mod:`plab.export.writers` from Python.
 
 PyVista is optional: ``pip install 'plab[render]'``. docs/rendering.md has the details.
 """

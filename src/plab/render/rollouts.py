@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.errors import tell
+from plab.errors import print_error
 from plab.problem import Problem, build_scenes, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
@@ -173,4 +173,4 @@ def _recording(
 @functools.cache
 def print_once(message: str) -> None:
     """Print a message once, even if it applies to several runs."""
-    tell(message)
+    print_error(message)

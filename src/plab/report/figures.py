@@ -29,9 +29,9 @@ from plab.report.tables import (
     TOLERANCE,
     compared_cells,
     demonstration_scores,
-    in_all,
     number,
     ordered_tasks,
+    overall_agreement,
     settings_note,
 )
 from plab.results.run_file import replace_file
@@ -251,7 +251,7 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
         xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect="equal", xlabel="score in the paper", ylabel="score here"
     )
     legend(figure)
-    whole = in_all(cells)
+    whole = overall_agreement(cells)
     panel.set_title(
         f"{len(cells)} configurations, r = {number(whole['correlation'])}, "
         f"{number(100.0 * whole['agree'], 0)} % agree"
@@ -338,7 +338,7 @@ def diagrams(table: pd.DataFrame) -> list[Drawing]:
     per contact model and kind.
 
     Args:
-        table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.measured`.
+        table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.read_benchmark`.
     """
     notes = ["Error against a much finer reference in float64; x above: diverged.", *origin(table)]
     table = table.astype(dict.fromkeys(("ms_per_step", *_ERRORS), float))

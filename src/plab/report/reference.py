@@ -65,7 +65,7 @@ ACCURACY = Benchmark(
 )
 
 
-def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
+def read_benchmark(path: Path, benchmark: Benchmark) -> pd.DataFrame:
     """Read a benchmark file; lines that begin with ``#`` describe its origin.
 
     Raises:

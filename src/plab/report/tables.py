@@ -180,7 +180,7 @@ def settings_note(runs: Runs) -> list[str]:
     ]
 
 
-def ends(interval: Interval, decimals: int = 2) -> str:
+def format_interval(interval: Interval, decimals: int = 2) -> str:
     """Format an interval; missing intervals become a dash."""
     if np.isnan(interval.low):
         return NOTHING
@@ -236,7 +236,7 @@ def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
     gaps = [Interval(*own) for own in common[["difference", "low", "high"]].itertuples(index=False)]
     compared = common[keys].assign(method=[method(m).label for m in common["method"]], plab=common["text"])
     compared = compared.assign(paper=papers, difference=[number(gap.value, sign=True) for gap in gaps])
-    compared[INTERVAL] = list(map(ends, gaps))
+    compared[INTERVAL] = list(map(format_interval, gaps))
     mean, settings = f"Mean ± standard deviation {what}.", settings_note(runs)
     notes, other = [mean, _BOLD, _INCOMPLETE, *settings], [_DIFFERENCE, *settings]
     numbers = common.drop(columns="text")
@@ -307,7 +307,9 @@ def agreement(runs: Runs) -> list[Table]:
         (f"all {kind}", own) for kind, own in cells.groupby(cells["method"].map(lambda n: method(n).kind))
     ]
     groups += kinds if len(kinds) > 1 else []
-    data = pd.DataFrame([{"method": label} | in_all(own) for label, own in [*groups, ("all", cells)]])
+    data = pd.DataFrame(
+        [{"method": label} | overall_agreement(own) for label, own in [*groups, ("all", cells)]]
+    )
     shown = pd.DataFrame(
         {
             "method": data["method"],
@@ -325,7 +327,7 @@ def agreement(runs: Runs) -> list[Table]:
     return [Table("agreement", "comparison", "Agreement with the paper's table", shown, data, notes=notes)]
 
 
-def in_all(cells: pd.DataFrame) -> dict[str, float]:
+def overall_agreement(cells: pd.DataFrame) -> dict[str, float]:
     """Return the overall agreement of some of the :func:`compared_cells`.
 
     Returns:
@@ -369,7 +371,7 @@ def solvability(runs: Runs) -> list[Table]:
             "demonstration": data["score"].map(number),
             "paper, best method": printed,
             "difference": [number(gap.value, sign=True) for gap in gaps],
-            INTERVAL: [ends(gap) for gap in gaps],
+            INTERVAL: [format_interval(gap) for gap in gaps],
         }
     )
     data[["difference", "low", "high"]] = [(gap.value, gap.low, gap.high) for gap in gaps]
@@ -465,7 +467,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
         which |= {"ms": mine.mean, "std": mine.std, "paper_ms": theirs}
         data.append(which | {"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": ratio})
         shown = f"{mean_and_std(mine)} ({mine.count})", number(theirs), number(gap.value, sign=True)
-        cells.append((task, kind, where, *shown, ends(gap), number(ratio, 1)))
+        cells.append((task, kind, where, *shown, format_interval(gap), number(ratio, 1)))
     columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
     table = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
     numbers = pd.DataFrame(data, columns=None if data else ["task", "measured", "what", "measurements", "ms"])

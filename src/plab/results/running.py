@@ -157,7 +157,7 @@ class RunFile:
         return self.result.rows > self._known
 
     def release(self) -> None:
-        """Release the run's lock, so that another process may resume the run; then write nothing."""
+        """Release the run's lock for other processes; nothing may be written afterwards."""
         if self._lock is not None:
             self._lock.release()
 

@@ -101,7 +101,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
 
 def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -> None:
-    """Execute unfinished tracks of one family; then each has finished or failed, without its lock."""
+    """Execute unfinished tracks of one family until each has finished or failed and released its lock."""
     party = [track for track in tracks if track.open]
     parties, cache = [party] if party else [], cache or SimulatorCache()
     try:

@@ -137,11 +137,11 @@ class Sizes(NamedTuple):
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def window(self, buffer_size: int) -> int:
-        """Return how many of the latest steps of N environments can be sampled, given transitions."""
+        """Return how many steps of N environments can be sampled after a number of transitions."""
         return max(buffer_size // self.envs, 1)
 
     def capacity(self, buffer_size: int, total_steps: int) -> int:
-        """Return how many episodes of N environments a buffer holds, given training transitions."""
+        """Return how many episodes of N environments a buffer for a number of transitions holds."""
         # One more, because the oldest samples may begin, and the latest end, within an episode.
         held = math.ceil(self.window(buffer_size) / self.horizon) + 1
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
@@ -166,7 +166,7 @@ class ReplayBuffer:
     def __init__(
         self, agents: int, sizes: Sizes, buffer_size: int, total_steps: int, device: torch.device
     ) -> None:
-        """Allocate each agent's buffer for the latest transitions, given their number in the training."""
+        """Allocate buffers for the latest transitions, given the number of training transitions."""
         self.added = 0
         self._sizes, self._window = sizes, sizes.window(buffer_size)
         self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
@@ -432,7 +432,7 @@ class Agents:
         cycle = self.cycle_steps(self.method, horizon)
         self.total_steps = whole_cycles(self.method.episodes * horizon, cycle)
         self.steps = self.updates = 0
-        self.draws = AgentRandom([cfg.seed for cfg in cfgs], device)
+        self.random = AgentRandom([cfg.seed for cfg in cfgs], device)
         self.networks = stacked(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._updates: dict[str, CapturedUpdate] = {}
@@ -499,7 +499,7 @@ class Agents:
             shared[f"{name}_steps"] = int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
         return [
             {**shared, **{name: table[k].copy() for name, table in rows.items()}, "random": random}
-            for k, random in enumerate(self.draws.states())
+            for k, random in enumerate(self.random.states())
         ]
 
     def restore(self, agent: int, state: Mapping[str, Any]) -> None:
@@ -514,7 +514,7 @@ class Agents:
         for name, optimizer in self.optimizers.items():
             for parameter in optimizer.param_groups[0]["params"]:
                 optimizer.state[parameter]["step"].fill_(int(state[f"{name}_steps"]))
-        self.draws.restore(agent, state["random"])
+        self.random.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
         """Return each agent's mean losses since the last call, by name."""
@@ -556,18 +556,18 @@ class OffPolicyAgents(Agents):
         self._observations = observations
         if self.steps < self.method.learning_starts:
             shape = self.sizes.envs, self.sizes.actions
-            self._actions = self.explore_at_random(self.draws.block("start", "uniform", *shape))
+            self._actions = self.explore_at_random(self.random.block("start", "uniform", *shape))
         else:
             self._actions = self._captured(self.explore, observations, self.noise()).clone()
         return self._actions
 
     def noise(self) -> Tensor:
         """Sample standard normal noise for the environments' actions, shape [agent, env, action]."""
-        return self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
+        return self.random.block("noise", "normal", self.sizes.envs, self.sizes.actions)
 
     def numbers(self) -> Tensor:
         """Sample the indices of an update's transitions, shape [agent, row]."""
-        return self.draws.block("numbers", "integers", self.method.batch_size)
+        return self.random.block("numbers", "integers", self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Return the actions used before learning starts, given uniformly random actions."""

@@ -52,7 +52,7 @@ class ApgRunner(Runner):
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Create network, with torch's default initial weights, and optimiser, or restore them."""
+        """Create or restore the network, with torch's default initial weights, and the optimiser."""
         entries, action_dim = Spaces.of(self._episode).sizes
         widths = itertools.pairwise([entries, *self.method.hidden, action_dim])
         with torch.random.fork_rng(devices=[]):
@@ -85,7 +85,7 @@ class ApgRunner(Runner):
 
 
 FAMILY = Family(
-    label="a policy, trained through the simulator's gradient",
+    label="a policy trained with the simulator's gradient",
     config=ApgConfig,
     runner=ApgRunner,
     columns=("gradient_norm",),

@@ -187,7 +187,7 @@ def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
 
 
 FAMILY = Family(
-    label="parameters of a scene, fitted to observed particles",
+    label="scene parameters fitted to observed particles",
     config=IdentifyConfig,
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),

@@ -189,7 +189,7 @@ class MpcRunner(PlannerRunner):
 
 
 FAMILY = Family(
-    label="actions of plans that are updated every few steps",
+    label="actions from a plan that is updated every few steps",
     config=MpcConfig,
     runner=MpcRunner,
     ranking="score",

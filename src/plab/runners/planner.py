@@ -345,7 +345,7 @@ class PlannerRunner(Runner):
         self.problem.simulator.set_contact(list(models) * width, np.tile(softness, width).tolist())
         parts: dict[str, list[Tensor]] = defaultdict(list)
         for part in tried.split(width):
-            trials = self.problem.try_out(part.flatten(0, 1), gradient=first.gradient)
+            trials = self.problem.evaluate_actions(part.flatten(0, 1), gradient=first.gradient)
             broken = torch.zeros(part.shape[:2].numel(), dtype=torch.bool, device=self._device)
             broken[list(trials.failures)] = True
             reasons |= {e % len(self.tracks): text for e, text in trials.failures.items()}

@@ -117,7 +117,7 @@ class PodsRunner(ImitationRunner):
         optimizer = torch.optim.Adam([plan], lr=rate)
         for _ in range(self.method.updates):
             given = plan.detach()
-            tried = self.batch.problem.try_out(
+            tried = self.batch.problem.evaluate_actions(
                 given if given.is_cuda else given.double().numpy(), gradient=True
             )
             self._note_failures(tried.failures)

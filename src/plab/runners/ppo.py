@@ -172,7 +172,7 @@ class PpoAgents(Agents):
         with torch.no_grad():
             mean, values = self._evaluate(seen)
             std = self.networks["log_std"][""].exp().unsqueeze(1)
-            noise = self.draws.block("noise", "normal", self.sizes.envs, self.sizes.actions)
+            noise = self.random.block("noise", "normal", self.sizes.envs, self.sizes.actions)
             actions = mean + std * noise
             self.observations[:, :, step], self.actions[:, :, step] = seen, actions
             self.rollout["values"][:, :, step] = values
@@ -205,7 +205,7 @@ class PpoAgents(Agents):
             self.judge(self._values(observations), self._over)
             rows = math.ceil(self._size / self.method.minibatches)
             for _ in range(self.method.epochs):
-                for numbers in self.draws.draw("permutation", self._size).split(rows, dim=1):
+                for numbers in self.random.draw("permutation", self._size).split(rows, dim=1):
                     self._note(self._captured(self.minibatch, numbers.contiguous()))
                 self.updates += 1
             self._over = []

@@ -129,7 +129,7 @@ class RlRunner(PolicyRunner):
         return stack.policy(number)
 
     def _first_observations(self) -> Tensor:
-        """Begin the first episodes, or replay the checkpoint's up to its step; return observations."""
+        """Begin the first episodes, or replay those of the checkpoint; return the observations."""
         for stack in self.stacks:
             stack.watched = self.watched
         observations = self._own(self._env.reset(episode=self.episodes // self._envs), self._envs)

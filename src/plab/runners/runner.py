@@ -22,7 +22,7 @@ import numpy as np
 
 from plab.config import Config, ConfigError
 from plab.config.families import SOLVED, family
-from plab.errors import TRACEBACK, PlabError, out_of_memory, tell, traceback_wanted
+from plab.errors import TRACEBACK, PlabError, out_of_memory, print_error, traceback_wanted
 from plab.objective import chamfer_distance, earth_movers_distance
 from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import BUDGETS, ResultsError, RunFile, row_count
@@ -243,7 +243,7 @@ def report(outcomes: Sequence[Outcome]) -> int:
     print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)
     for one in outcomes:
         if not one.finished:
-            tell(f"{one.title}: {one.message}")
+            print_error(f"{one.title}: {one.message}")
     return 2 if count["refused"] else int(any(not one.finished for one in outcomes))
 
 

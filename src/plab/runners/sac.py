@@ -82,7 +82,7 @@ class SacAgents(OffPolicyAgents):
 
     def update(self) -> None:
         shape, numbers = (self.method.batch_size, self.sizes.actions), self.numbers()
-        noise = [self.draws.block(use, "normal", *shape) for use in ("actions", "next actions")]
+        noise = [self.random.block(use, "normal", *shape) for use in ("actions", "next actions")]
         self._note(self._captured(self.descent, numbers, *noise))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:

@@ -347,7 +347,7 @@ class Cmaes(Sampler):
 
 
 FAMILY = Family(
-    label="an action sequence, optimised by sampling many candidates",
+    label="an action sequence optimised by sampling many candidates",
     config=PlannerConfig,
     runner=PlannerRunner,
     ranking="score",

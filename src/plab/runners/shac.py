@@ -157,7 +157,7 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 
 
 FAMILY = Family(
-    label="a policy, trained through the simulator's gradient and by a value function",
+    label="a policy trained with the simulator's gradient and a value function",
     config=ShacConfig,
     runner=ShacRunner,
     columns=ShacRunner.columns,

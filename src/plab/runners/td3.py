@@ -85,7 +85,7 @@ class Td3Agents(OffPolicyAgents):
         delayed = self.updates % self.method.policy_delay != 0
         update, numbers = self.critics if delayed else self.both, self.numbers()
         shape = self.method.batch_size, self.sizes.actions
-        noise = self.draws.block("smoothing", "normal", *shape)
+        noise = self.random.block("smoothing", "normal", *shape)
         self._note(self._captured(update, numbers, noise))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:

@@ -520,7 +520,7 @@ class Scene:
         return facts
 
     def validate(self) -> None:
-        """Raise SceneError, which names the field and a valid value, for an invalid scene."""
+        """Raise SceneError for an invalid scene; the message names the field and a valid value."""
         _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):

@@ -593,7 +593,7 @@ class CpuEngine(CpuPhases):
 
     @ti.kernel
     def export_mass(self, out: Array):
-        """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
+        """Write the node masses of the last :meth:`losses` to a cleared batch of n^3 tensors."""
         for e in range(self.batch):
             for entry in range(e * self.blocks, e * self.blocks + self.block_count[e]):
                 for r in range(BLOCK_NODES):

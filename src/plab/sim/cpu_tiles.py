@@ -71,8 +71,10 @@ class TilePhases(ParticlePhases):
         ti.static(self.function(unit, name))(*self.arguments(unit, at, numbers))
 
     @ti.func
-    def ask(self, unit: ti.template(), name: ti.template(), at: ti.template(), numbers: ti.template()):
-        """Call a function of the bitcode that returns a number."""
+    def call_returning(
+        self, unit: ti.template(), name: ti.template(), at: ti.template(), numbers: ti.template()
+    ):
+        """Call a bitcode function that returns a number."""
         result = ti.cast(0.0, self.real)
         ti.static(self.function(unit, name))(*self.arguments(unit, at, numbers), result)
         return result
@@ -181,7 +183,9 @@ class TilePhases(ParticlePhases):
             self.lane_of(state_at, source, lane),
             self.lane_of(state_at, target, lane),
         ]
-        speed = self.ask("transfers", "gather", addresses, [self.dt, self.x_max, 4.0 * self.inv_dx])
+        speed = self.call_returning(
+            "transfers", "gather", addresses, [self.dt, self.x_max, 4.0 * self.inv_dx]
+        )
         self.note_speed(speed, e, time)
 
     @ti.func
@@ -290,7 +294,7 @@ class TilePhases(ParticlePhases):
                 elif self.strain_tile(first, x, e, entry9, at, number, "strain"):
                     # In parts; the new F is computed last.
                     numbers = [number, self.stress_scale, self.mass]
-                    rigid = self.ask(number, "stress", [first, x, affine], numbers)
+                    rigid = self.call_returning(number, "stress", [first, x, affine], numbers)
                     if ti.static(update):
                         if rigid < 1.0:
                             self.call(number, "flow", [first, new], [number])
@@ -309,7 +313,7 @@ class TilePhases(ParticlePhases):
         results for the adjoint; return whether all lanes are in the range of the series."""
         self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
         limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return self.ask(number, kind, [first, x], limits) > 0.0
+        return self.call_returning(number, kind, [first, x], limits) > 0.0
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
@@ -335,7 +339,9 @@ class TilePhases(ParticlePhases):
                     if ti.static(self.full_gradient):
                         self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, size, number)
                 elif self.strain_tile(first, x, e, entry9, at, number, "whole_strain"):
-                    rigid = self.ask(number, "stress_adjoint", [first, affine], [number, self.stress_scale])
+                    rigid = self.call_returning(
+                        number, "stress_adjoint", [first, affine], [number, self.stress_scale]
+                    )
                     if rigid < 1.0:
                         self.call(number, "flow_adjoint", [first, bars], [number])
                     else:

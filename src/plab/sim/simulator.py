@@ -765,7 +765,7 @@ class Simulator:
     def _start_positions(
         self, scenes: Sequence[Scene], particles: Sequence[np.ndarray] | None
     ) -> list[np.ndarray]:
-        """Return checked initial positions, sampled from the scenes if ``None`` is given."""
+        """Return checked initial positions, by default sampled from the scenes."""
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
         given = map(sample_particles, scenes) if particles is None else particles

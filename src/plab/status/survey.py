@@ -178,7 +178,7 @@ def _measured(path: Path, total: int) -> dict[str, Any]:
 
 
 def _with_estimates(table: pd.DataFrame) -> pd.DataFrame:
-    """Estimate the remaining time of runs of unknown speed from finished runs of task and method."""
+    """Estimate the remaining time of runs of unknown speed from similar finished runs."""
     done = table["state"] == "done"
     mean = table["seconds"].where(done).groupby([table["task"], table["method"]]).transform("mean")
     share = (table["done"] / table["total"].where(table["total"] > 0)).fillna(0.0)

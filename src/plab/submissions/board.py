@@ -151,7 +151,7 @@ def _paper() -> dict[str, Any]:
     protocol = (
         "protocol=release, the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
-        f"{PAPER_SEED_COUNT} seeds. Nothing handed in is judged like this, so that these numbers compare "
-        "with those of no other table."
+        f"{PAPER_SEED_COUNT} seeds. Submissions are scored differently, so these numbers are not comparable "
+        "with those of other tables."
     )
     return _table("The paper's table", protocol, SUITE_VARIANTS, lines)

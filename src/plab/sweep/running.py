@@ -31,7 +31,7 @@ from plab.config.compose import check_sources, choices, compose, finish, hydra_a
 from plab.config.families import family
 from plab.config.overrides import parse, swept
 from plab.config.selection import OBSERVATION_KEYS
-from plab.errors import tell
+from plab.errors import print_error
 from plab.plugins import exported_module_path
 from plab.problem import build_scenes
 from plab.results import ResultsError, RunFile, read, row_count
@@ -46,7 +46,7 @@ from plab.targets import TargetError
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
-Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
+Executor = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
 """Function that executes batches, given a progress text, and yields outcomes."""
 
 
@@ -79,9 +79,9 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         # An error common to all jobs.
         raise ConfigError(ended[0].message)
     with ExitStack() as stack:
-        carry, processes = carry_here, 1
+        execute, processes = execute_batches, 1
         if settings["inner"] is not None:
-            carry = partial(_carry_elsewhere, master, settings["inner"], by_path)
+            execute = partial(_submit_batches, master, settings["inner"], by_path)
             # As in joblib, -1 means one per core.
             wanted = settings["inner"].get("n_jobs", 1)
             processes = wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
@@ -89,10 +89,10 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
             for cfg in cfgs:
                 require_runnable(cfg)
             if settings["per_gpu"]:
-                carry, processes = stack.enter_context(_gpu_workers(settings["per_gpu"], len(cfgs)))
+                execute, processes = stack.enter_context(_gpu_workers(settings["per_gpu"], len(cfgs)))
         try:
             ended.extend(
-                run_batches(cfgs, carry, settings["batch_size"], processes, settings["per_gpu"] or 1)
+                run_batches(cfgs, execute, settings["batch_size"], processes, settings["per_gpu"] or 1)
             )
         finally:
             code = report(ended)
@@ -221,7 +221,7 @@ def _limit(cfg: Config, size: int | None, sharing: int) -> int:
 
 
 def run_batches(
-    cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1, sharing: int = 1
+    cfgs: Sequence[Config], execute: Executor, size: int | None = None, processes: int = 1, sharing: int = 1
 ) -> Iterator[Outcome]:
     """Execute the unfinished runs of a sweep and yield outcomes.
 
@@ -240,7 +240,9 @@ def run_batches(
     todo = [cfg for path, cfg in wanted.items() if path not in ended]
     while todo:
         away = []
-        for one in carry(plan(todo, size, processes, sharing), lambda: f"[{len(ended)}/{len(wanted)} runs] "):
+        for one in execute(
+            plan(todo, size, processes, sharing), lambda: f"[{len(ended)}/{len(wanted)} runs] "
+        ):
             if one.status == "elsewhere":
                 away.append(one)
             else:
@@ -250,14 +252,14 @@ def run_batches(
         yield from (one for one in away if held(one.path))
 
 
-def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
+def execute_batches(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
     """Execute batches sequentially in this process."""
     cache = SimulatorCache()
     for batch in batches:
         yield from runners.run_batch(batch, progress(), cache)
 
 
-def _carry_elsewhere(
+def _submit_batches(
     master: DictConfig,
     inner: DictConfig,
     jobs: Mapping[str, list[str]],
@@ -284,8 +286,8 @@ def _carry_elsewhere(
         yield from [one for job in returns for one in job.return_value]
     except Exception as error:
         # A job was killed, or the queue rejected the jobs; the result files have the progress.
-        tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
-        yield from [look_up(cfg) for batch in batches for cfg in batch]
+        print_error(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
+        yield from [stored_outcome(cfg) for batch in batches for cfg in batch]
 
 
 def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Outcome]:
@@ -295,7 +297,7 @@ def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Out
     return runners.run_batch(batches[number], note, SimulatorCache())
 
 
-def look_up(cfg: Config) -> Outcome:
+def stored_outcome(cfg: Config) -> Outcome:
     """Return the outcome of a run whose process was killed, from its files."""
     path = cfg.path
     if (done := _finished_before(cfg)) is not None:
@@ -326,7 +328,7 @@ def _finished_before(cfg: Config) -> Outcome | None:
 
 
 @contextmanager
-def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Carrier, int]]:
+def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Executor, int]]:
     """Start ``per_gpu`` processes on each GPU, at most ``most`` in total, for the duration of the ``with``
     block; yield a function that executes batches with them, and their number. Raise ConfigError if there
     is no GPU."""
@@ -371,7 +373,7 @@ def _dispatch(
             except BrokenProcessPool:
                 # After a kill, the result files have the progress.
                 pools[number] = _pool(places[number])
-                yield from map(look_up, batch)
+                yield from map(stored_outcome, batch)
 
 
 # Code below runs in the worker processes.

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from plab.errors import ArgumentError, tell
+from plab.errors import ArgumentError, print_error
 from plab.status.survey import STATES, Survey
 
 INTERVAL = 1.0
@@ -53,7 +53,7 @@ def show(found: Survey) -> None:
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for error in found.unreadable:
-        tell(f"left out: {error}")
+        print_error(f"left out: {error}")
 
 
 def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.sleep) -> None:
