@@ -18,9 +18,7 @@ from plab.runners.policy import load_policy, policy_path
 from same_runs import KeepsAll, finished_as, stopped_at
 from toy_runner import COARSE_32
 
-COARSE = (
-    "observe_particles=5", "observe_target=true", *COARSE_32, "progress=false",
-)  # fmt: skip
+COARSE = ("observe_particles=5", "observe_target=true", *COARSE_32, "progress=false")
 CACHE = KeepsAll()
 
 
@@ -64,6 +62,23 @@ def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None
         last = {key: values[-1] for key, values in theirs.observations.items()}
         assert dataset.observation_space.contains(last)
     assert dataset.recover_environment().observation_space == dataset.observation_space
+
+
+def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> None:
+    ranges = ["yield_stress=[20,200]", "bodies.ball.offset=[[0,0,0],[0.02,0,0]]", "scenes=2"]
+    words = ["task=Move", "variant=random", "seed_scene=1000", "seed=0,1"]
+    words += ["method=adam", "method.iterations=2"]
+    drawn = [f"+task.randomize.{one}" for one in ranges]
+    assert main([*words, *drawn, f"results_dir={tmp_path}", *COARSE, "--output", str(tmp_path)]) == 0
+    kwargs = json.loads(metadata_of(tmp_path / "plab/Move-v0")["env_spec"])["kwargs"]
+    words = [*kwargs["overrides"], "variant=random"]
+    env = plab.make("Move", 1, overrides=words, randomize=kwargs["randomize"])
+    episodes = list(read_episodes(tmp_path / "plab/Move-v0"))
+    for one in episodes:
+        values = {key: of_states[0] for key, of_states in one.infos["randomized"].items()}
+        steps = [env.reset(seed=9, options=values)[0], *(env.step(action)[0] for action in one.actions)]
+        assert np.array_equal(steps, one.observations)
+    assert len({one.infos["randomized"]["yield_stress"][-1] for one in episodes}) == 2
 
 
 def cloned(folder: Path, *words: str) -> Config:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from plab.config import build_scene, load_config
-from plab.envs.observations import level_entries
 from plab.scenes import MANIPULATOR_SHAPES, Camera, SceneError, make_body
 from plab.sim import shapes
 
@@ -28,12 +27,6 @@ def test_the_time_step_that_is_advised_is_accepted():
     dt, substeps = re.findall(r"= ([\d.e-]+)", str(caught.value))
     assert int(substeps) * float(dt) == pytest.approx(unstable.substeps * unstable.dt, rel=0.02)
     replace(scene, dt=float(dt), substeps=int(substeps)).validate()
-
-
-def test_entries_along_x_and_z_are_two_apart():
-    cfg = load_config(["task=Move", "observe_target=true"])
-    along_x, along_z = level_entries(build_scene(cfg), cfg)
-    np.testing.assert_array_equal(along_z - along_x, 2)
 
 
 def test_a_camera_projects_what_it_sees_back_from_any_side():

@@ -240,11 +240,13 @@ class _Recorder:
                 continue
             named = {"task": one.cfg.task.name, "variant": one.cfg.variant, "source": one.source}
             measured = {key: np.array([info[key][e] for info in infos]) for key in ("loss", "iou", "score")}
+            drawn = infos[0]["randomized"] if one.cfg.task.randomize else {}
+            sampled = {key: np.array([info["randomized"][key][e] for info in infos]) for key in drawn}
             yield Episode(
                 observations=mapped(lambda *rows, e=e: np.stack([row[e] for row in rows]), *seen),
                 actions=actions[e],
                 rewards=np.array([reward[e] for reward in rewards]),
-                infos=measured,
+                infos=measured | ({"randomized": sampled} if sampled else {}),
                 attributes=named | {"score": float(measured["score"][-1])},
             )
 
@@ -260,6 +262,8 @@ class _Recorder:
             "overrides": words,
             "observe": self._observe,
         }
+        if cfg.task.randomize:
+            kwargs["randomize"] = cfg.task.randomize
         if self._cameras is not None:
             kwargs["cameras"] = {name: asdict(camera) for name, camera in self._cameras.items()}
         return gymnasium.envs.registration.EnvSpec(

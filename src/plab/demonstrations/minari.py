@@ -40,14 +40,15 @@ class Episode:
         observations: Observations before each step and after the last, shape [T + 1, ...], or by key.
         actions: Actions, shape [T, A].
         rewards: Rewards, shape [T].
-        infos: Measures of the states, by name, shape [T + 1] each.
+        infos: Measures of the states, by name, shape [T + 1] each; sampled parameters are under
+            ``randomized``, by dotted key, shape [T + 1, ...] each.
         attributes: Attributes of the episode: numbers and strings by name.
     """
 
     observations: Any
     actions: np.ndarray
     rewards: np.ndarray
-    infos: Mapping[str, np.ndarray]
+    infos: Mapping[str, Any]
     attributes: Mapping[str, Any]
 
 

@@ -23,6 +23,7 @@ import plab
 from plab.config import Config
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
+from plab.errors import tell
 from plab.render import RenderError, rollouts
 from plab.report.statistics import BUDGETS, load_rows
 from plab.results import ResultsError, Row
@@ -350,7 +351,8 @@ def record(env: Env, folder: str | Path) -> Env:
     For each configuration, a file in ``folder`` contains the actions of the best episode within each budget
     of :data:`plab.report.statistics.BUDGETS` and overall, with the environment steps simulated until then.
     All environments of one configuration in a process share it. It is written whenever an episode improves;
-    the steps of abandoned episodes count.
+    the steps of abandoned episodes count. Randomised episodes are left out with a warning, because
+    verification simulates the task as configured; only their steps count.
 
     Args:
         env: A single or vector environment of plab in the hard contact model, with any wrappers.
@@ -376,12 +378,19 @@ def record(env: Env, folder: str | Path) -> Env:
             _ledgers[path] = _BestEpisodes(cfg, path)
         ledgers.append(_ledgers[path])
     taken: deque[np.ndarray] = deque(maxlen=batch.horizon)
+    told = False
 
     def observe(actions: Any, result: Transition) -> None:
+        nonlocal told
         taken.append(np.array(actions, np.float64))
         for ledger in ledgers:
             ledger.steps += 1
-        if "randomized" in result.info or not result.truncated.any():
+        if not result.truncated.any():
+            return
+        if "randomized" in result.info:
+            if not told:
+                tell(f"{folder}: randomised episodes are not recorded: evaluate in the task as configured")
+            told = True
             return
         # The last steps of a complete episode are the whole episode.
         episodes = np.stack(taken, axis=1)
