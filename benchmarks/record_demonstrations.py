@@ -1,4 +1,4 @@
-"""Recording of the best known actions of the suite: the bundled ones, or better runs of some results.
+"""Recorder of the suite's best known actions: the bundled actions, or better ones from given results.
 
     python benchmarks/record_demonstrations.py results
     python benchmarks/record_demonstrations.py results --task Move,Rope sim.device=cuda

@@ -73,7 +73,7 @@ def sheared(law: Law, own: list[float], rate: float, steps: int, squeeze: float 
 
 def test_shear_follows_closed_forms() -> None:
     """Elastic: mu gamma, and a normal stress mu gamma^2. Fluid: eta times the rate. Herschel-Bulkley: yield
-    stress and consistency times a power of the rate. Sand: what its friction allows of the pressure."""
+    stress and consistency times a power of the rate. Sand: the pressure times its friction."""
     mu, lam = coefficients(LAWS["elastic"])
     tau = sheared(LAWS["elastic"], [mu, lam], 10.0, 100)
     np.testing.assert_allclose(tau[[0, 1, 3]], [mu * 0.01, 0.0, mu * 0.1], atol=1e-9)
@@ -130,7 +130,7 @@ def principal_stress(law: str, strain: np.ndarray, own: list[float]) -> np.ndarr
 def test_blocks_carry_the_stress_of_closed_forms(size: float) -> None:
     """In uniaxial compression and in simple shear under pressure, elastic and yielding.
 
-    The stress of a body is what a substep adds to the moment of its momentum.
+    The stress of a body is the change of the moment of its momentum in a substep.
     """
     names, grid, edge = ("elastic", "drucker_prager", "viscoplastic"), 32, 6
     block = laws.lattice(edge, edge, edge) / grid

@@ -115,7 +115,7 @@ def test_a_run_under_way_in_another_process_is_left_to_it(sweep, capsys) -> None
     busy = configs(seeds=(1,))[0]
     other = RunFile(busy)
     code, counts, lines = sweep("seed=0,1")
-    assert (code, counts) == (1, {"runs": 2, "finished": 1, "under way in another process": 1})
+    assert (code, counts) == (1, {"runs": 2, "finished": 1, "running in another process": 1})
     assert len(lines) == 1 and "Rope-v1 adam seed 1: " in lines[0] and str(busy.path) in lines[0]
     assert main([*COARSE, "seed=1"]) == 1
     assert str(busy.path) in capsys.readouterr().err
@@ -249,7 +249,7 @@ def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> N
     # As joblib counts: all of three processors but one.
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:-2}")
-    assert (code, counts) == (1, {"runs": 6, "not under way": 6})
+    assert (code, counts) == (1, {"runs": 6, "not running": 6})
     assert asked == [2] and "RuntimeError: nobody is there" in lines[0]
 
 

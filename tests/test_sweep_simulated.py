@@ -33,7 +33,7 @@ def configs(folder: Path) -> list[Config]:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> list[RunResult]:
-    """Each run by itself."""
+    """Results of each run executed alone."""
     cfgs = configs(tmp_path_factory.mktemp("alone"))
     for cfg in cfgs:
         run_config(cfg, CACHE)

@@ -122,7 +122,7 @@ def _outcome(simulator: Simulator, e: int, state: State, mass: np.ndarray, speed
     error = abs(mass[e].sum() / (scene.particle_mass * scene.particle_count) - 1.0)
     # NaN must fail these comparisons, too.
     if not error <= MASS_TOLERANCE[simulator.precision]:
-        return f"mass changed by {error:.1e} of itself"
+        return f"mass changed by a fraction of {error:.1e}"
     return "survived" if speed <= 1.0 else "a particle crossed a cell in a substep"
 
 

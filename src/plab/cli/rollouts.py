@@ -94,7 +94,7 @@ def view(argv: Sequence[str]) -> None:
     options = parser.parse_intermixed_args(argv)
     if options.gallery:
         if unwanted := [word for word in options.what if "=" not in word or word.startswith("task=")]:
-            raise ArgumentError(f"all tasks are shown: leave out '{unwanted[0]}'")
+            raise ArgumentError(f"all tasks are shown: omit '{unwanted[0]}'")
         output = (options.output or Path("gallery")) / "index.html"
     else:
         output = resolve_rollout(options, ".html")

@@ -67,7 +67,7 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     if options.multirun or str(master.hydra.mode).endswith("MULTIRUN"):
         return master
     if idle := [word for word in words if _OF_SWEEPS.match(word)]:
-        raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or leave it out")
+        raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or omit it")
     return None
 
 

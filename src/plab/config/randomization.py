@@ -1,9 +1,9 @@
 """Random task parameters of ``variant=random`` and of individual episodes.
 
-``variant=random`` is sampled once, from the ranges in the task's section ``random``; samples depend only on
+``variant=random`` is sampled once, from the ranges in the task's ``random`` section; samples depend only on
 the task and on ``seed_scene``, not on the method's seed, the machine, the grid or the number of particles.
 
-The section ``randomize``, from which every episode is sampled, has the structure of the task, like variants,
+The ``randomize`` section, from which every episode is sampled, has the structure of the task, like variants,
 with a range ``[low, high]`` in place of each number or list of numbers: ``{yield_stress: [50, 200], gravity:
 [[0, -33, 0], [0, -27, 0]]}``. Additional keys are ``offset`` of bodies and manipulators, ``yaw`` of bodies,
 and ``observation_noise``; ``scenes: 20`` selects one of 20 scenes of ``variant=random``.

@@ -134,7 +134,7 @@ class KinematicsConfig(ranges.Section):
         start: Initial positions, by patterns of joints; default: 0, or the nearest limit.
         limits: Lowest and highest positions, by patterns of joints; default: the model's.
         together: Patterns of joints that share one action component, by the component's name.
-        omit: Patterns of collision geometry to leave out.
+        omit: Patterns of omitted collision geometry.
         friction: Coulomb friction of all links with the plasticine.
         sha256: SHA-256 of the tree. Default: computed; another checksum is rejected.
     """

@@ -36,7 +36,7 @@ def read_model(
         model: MJCF or URDF file, or ``package:path`` of a file in an installed package.
         root: Body whose frame becomes the model frame; default: the model's world frame.
         size: Domain units per unit of length of the model.
-        omit: Patterns of names of geometry to leave out.
+        omit: Patterns of names of omitted geometry.
 
     Returns:
         The tree with joints at the model's rest position, the model's limits, and scale 0; and the SHA-256 of

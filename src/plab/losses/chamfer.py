@@ -27,7 +27,7 @@ class Chamfer(ParticleTerm):
     """Squared Chamfer distance between particles and target, with its gradient."""
 
     name = "chamfer"
-    label = "mean squared distances of particles and points of the target to the nearest of the other"
+    label = "mean squared distances from particles to the nearest target points, and vice versa"
     unit = "domain units^2"
 
     def attach(self, sim) -> None:

@@ -92,7 +92,7 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
     numbers = actions.dtype.kind in "iuf" and np.isfinite(actions).all()
     if not numbers or actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
         has = f"actions of shape {list(actions.shape)}"
-        raise RenderError(f"{path} has {has}, its task takes finite ones of shape [steps, {components}]")
+        raise RenderError(f"{path} has {has}, but its task needs finite ones of shape [steps, {components}]")
     return cfg, actions
 
 
@@ -114,7 +114,7 @@ def demonstration(cfg: Config) -> np.ndarray:
         print_once(f"there is no {which} so the manipulators do not move")
         return np.zeros((scene.horizon, scene.action_dim))
     if (count := actions.shape[1]) != scene.action_dim:
-        raise RenderError(f"the {which} has {count} action components, this scene takes {scene.action_dim}")
+        raise RenderError(f"the {which} has {count} action components, but this scene has {scene.action_dim}")
     return actions
 
 

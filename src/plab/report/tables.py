@@ -93,7 +93,7 @@ _NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
 
 
 def mean_and_std(summary: Summary, decimals: int = 2) -> str:
-    """Format a mean with its standard deviation, omitted for a single number."""
+    """Format a mean with its standard deviation, which is omitted for a single number."""
     mean = number(summary.mean, decimals)
     return mean if summary.count < 2 else f"{mean} ± {number(summary.std, decimals)}"
 

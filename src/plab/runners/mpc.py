@@ -44,7 +44,7 @@ class MpcConfig(MethodConfig):
     Attributes:
         window: Length of a plan [environment steps]; shorter at the end of the episode.
         execute: Number of steps of each plan that are executed.
-        planner: Section ``method`` of a planner or gradient method; its iterations are those of each plan.
+        planner: The ``method`` section of a planner or gradient method; ``iterations`` applies to each plan.
     """
 
     window: int = field(metadata=ranges.COUNT)

@@ -1,7 +1,7 @@
 """Trained policies: keys, torch settings and policy files.
 
 The file beside a result, ``<name>.policy.npz``, contains only arrays: the parameters of the networks by name,
-the bounds of observations and actions, and a JSON header with the section ``method`` of the run, from which
+the bounds of observations and actions, and a JSON header with the ``method`` section of the run, from which
 the networks are rebuilt. Reading it unpickles and imports nothing.
 """
 
@@ -76,7 +76,7 @@ class PolicyConfig(MethodConfig):
 
 
 class Spaces(NamedTuple):
-    """Spaces of an observation and of an action."""
+    """Observation and action spaces."""
 
     observation_space: Box
     action_space: Box

@@ -1,6 +1,6 @@
 """Reinforcement learning (``sac``, ``td3`` and ``ppo``) with one or more agents.
 
-Runs of a sweep with the same section ``method`` form a population: agents and their environments in one
+Runs of a sweep with the same ``method`` section form a population: agents and their environments in one
 simulator, with one file each. A run alternates between training, for some episodes, and one episode of the
 deterministic policy, which produces a row of the results. To reproduce a result:
 

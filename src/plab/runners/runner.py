@@ -200,7 +200,7 @@ def title(*cfgs: Config) -> str:
     return f"{first.task.name}-v{first.variant} {first.method.name} seed {first.seed}"
 
 
-_UNFINISHED = {"elsewhere": "under way in another process", "lost": "not under way"}
+_UNFINISHED = {"elsewhere": "running in another process", "lost": "not running"}
 
 
 @dataclass(frozen=True)

@@ -230,7 +230,7 @@ def make_body(
     """
     if shape != "mesh":
         if file is not None:
-            raise SceneError(f"file has no effect with shape {shape}: leave it out, or use shape mesh")
+            raise SceneError(f"file has no effect with shape {shape}: omit it, or use shape mesh")
         return Body(shape, vector3(center), tuple(size), particles, **material)
     if file is None:
         raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
@@ -481,7 +481,7 @@ class Scene:
 
     @property
     def tools(self) -> tuple[Manipulator, ...]:
-        """Manipulators with action components of their own: all except the links of an articulated model."""
+        """Manipulators with separate action components: all except the links of an articulated model."""
         links = len(self.kinematics.links) if self.kinematics else 0
         return self.manipulators[: len(self.manipulators) - links]
 

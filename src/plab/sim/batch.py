@@ -126,8 +126,8 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
         numbers = np.asarray(value, float)
         if numbers.ndim > 1 and scenes[0].material_count == 1:
             raise SceneError(
-                f"{name} has shape {numbers.shape}, but all bodies share one material: give a body of the "
-                "scene its own"
+                f"{name} has shape {numbers.shape}, but all bodies share one material: set the material "
+                "of a body in the scene"
             )
         table = numbers if numbers.ndim > 1 else numbers.reshape(-1, 1)
         if any(own not in (1, count) for own, count in zip(table.shape, counts, strict=True)):

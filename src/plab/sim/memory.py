@@ -120,7 +120,7 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
 
 
 def held_bytes(*holders: object) -> int:
-    """Return the memory of all fields and arrays among the attributes of objects, including lists [bytes]."""
+    """Return the memory of all fields and arrays that objects hold, directly or in lists [bytes]."""
     values = [value for holder in holders for value in vars(holder).values()]
     values += [part for value in values if isinstance(value, list) for part in value]
     held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}

@@ -538,7 +538,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         if gradient and not self.terms:
-            raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
+            raise ArgumentError("there is no loss to differentiate: pass terms to Simulator")
         array, steps, poses, plan = self._started(actions, gradient)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
@@ -626,7 +626,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         if not self.terms:
-            raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
+            raise ArgumentError("there is no loss to differentiate: pass terms to Simulator")
         return closed_loop(self, steps, choose, react, stride, discount, like)
 
     def state_gradient(self) -> State:

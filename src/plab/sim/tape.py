@@ -87,7 +87,7 @@ class Tape:
         lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
         if not lengths:
             raise MemoryError(
-                f"a gradient of {steps} steps has more numbers than Taichi can address, whatever the memory: "
+                f"a gradient of {steps} steps has more numbers than Taichi can address: "
                 "simulate fewer environments together, or fewer steps"
             )
         slots = {n: kept_states(steps, self._slots_per_step, n, reach) for n in lengths}

@@ -174,14 +174,14 @@ def play(
             actions = actor(observations)
             if actions.shape[1] != components:
                 given = f"{name} gives actions of {actions.shape[1]} components"
-                raise SubmissionError(f"{given}, its task takes {components}")
+                raise SubmissionError(f"{given}, but its task has {components}")
             if not np.array_equal(actions, actor(observations)):
                 raise SubmissionError(f"{name} is not deterministic: actions for one observation differ")
         else:
             plans, shape = actor[start : start + _BATCH], (batch.horizon, components)
             for cfg, plan in zip(some, plans, strict=True):
                 if plan.shape != shape:
-                    given = f"the plan has shape {list(plan.shape)}, its task takes {list(shape)}"
+                    given = f"the plan has shape {list(plan.shape)}, but its task needs {list(shape)}"
                     raise SubmissionError(f"{cfg.task.name}-v{cfg.variant}: {given}")
         for t in range(batch.horizon):
             actions = actor(observations) if callable(actor) else np.stack([plan[t] for plan in plans])
