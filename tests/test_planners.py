@@ -29,7 +29,7 @@ from plab.runners.planner import (
 from plab.runners.runner import SimulatorCache
 from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
-from plab.sweep.running import plan
+from plab.sweep.execution import plan
 from same_runs import assert_same_numbers
 from toy_runner import COARSE_32
 

@@ -15,7 +15,7 @@ from plab.config.families import FAMILIES, Family
 from plab.plugins import exported_module_path, load_object, search_in
 from plab.results import check, read
 from plab.runners import Runner, run_batch
-from plab.sweep.running import plan
+from plab.sweep.execution import plan
 from toy_runner import COARSE
 
 

@@ -19,7 +19,7 @@ from plab.results import check, read, rows
 from plab.runners import run_config
 from plab.scenes import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator
-from plab.sweep.running import plan
+from plab.sweep.execution import plan
 from plab.targets import TargetError
 from suite import CENTER, assert_same_state, reference_state, scene, tools
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-import plab.sweep.running as planning
+import plab.sweep.execution as planning
 import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
@@ -18,7 +18,7 @@ from plab.results import RunFile, read
 from plab.results.running import acquire
 from plab.runners.runner import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
-from plab.sweep.running import compose_jobs, plan, stored_outcome
+from plab.sweep.execution import compose_jobs, plan, stored_outcome
 from same_runs import raising
 from toy_runner import COARSE, WHY, assert_complete, computed, configs
 
@@ -245,7 +245,7 @@ def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> N
 
     queue = SimpleNamespace(launch=launch)
     launchers = SimpleNamespace(instantiate_launcher=lambda **settings: queue)
-    monkeypatch.setattr("plab.sweep.running.Plugins", SimpleNamespace(instance=lambda: launchers))
+    monkeypatch.setattr("plab.sweep.execution.Plugins", SimpleNamespace(instance=lambda: launchers))
     # As joblib counts: all of three processors but one.
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:-2}")

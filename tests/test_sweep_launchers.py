@@ -23,7 +23,7 @@ from plab.results import read
 from plab.results.running import lock_path
 from plab.runners import run_batch
 from plab.runners.runner import Outcome
-from plab.sweep import running
+from plab.sweep import execution
 from same_runs import assert_same_numbers
 from toy_runner import COARSE, assert_complete, configs
 
@@ -47,8 +47,8 @@ def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         print(f"{note}{len(batch)} runs", flush=True)
         return run_batch(batch)
 
-    monkeypatch.setattr(running, "_pool", lambda gpu: ThreadPoolExecutor(1))
-    monkeypatch.setattr(running, "_carry_out", carry_out)
+    monkeypatch.setattr(execution, "_pool", lambda gpu: ThreadPoolExecutor(1))
+    monkeypatch.setattr(execution, "_carry_out", carry_out)
     return names
 
 

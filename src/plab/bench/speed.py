@@ -25,7 +25,7 @@ from plab.config.suite import suite_tasks
 from plab.errors import print_error
 from plab.progress import show_line
 from plab.report.reference import paper_table
-from plab.sweep.running import jobs_of
+from plab.sweep.execution import jobs_of
 
 COLUMNS = (
     "task", "device", "precision", "batch", "grid", "particles", "what", "first_s", "median_ms", "min_ms",

@@ -125,7 +125,7 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     config_dir = options.config_dir
     if sources:
         return _of_results(sources, words)
-    from plab.sweep.running import compose_jobs, jobs_of
+    from plab.sweep.execution import compose_jobs, jobs_of
 
     given = {one.key_or_group for one in parse(prepared(words))}
     every = [] if "variant" in given else [f"variant={','.join(SUITE_VARIANTS)}"]
@@ -151,7 +151,7 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
 
 def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
     """Execute runs, and return the best actions of those that have not failed."""
-    from plab.sweep.running import execute_batches, run_batches
+    from plab.sweep.execution import execute_batches, run_batches
 
     for one in run_batches(cfgs, execute_batches, together):
         if not one.finished:

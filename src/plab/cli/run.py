@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         if (master := _sweep_settings(options, words)) is not None:
             # Imported here and below, because torch and Taichi take seconds to load.
-            from plab.sweep.running import sweep
+            from plab.sweep.execution import sweep
 
             return sweep(words, master, config_dir)
         cfg = load_config(words, config_dir, alone=True)

@@ -14,7 +14,7 @@ from plab.objective import TERMS, check_terms
 from plab.plugins import load_object
 
 if TYPE_CHECKING:
-    from plab.losses.checking import check_gradient
+    from plab.losses.gradient_check import check_gradient
     from plab.losses.term import Term
 
 __all__ = ["TERMS", "check_gradient", "make_terms"]
@@ -54,7 +54,7 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
 def __getattr__(name: str) -> Any:
     """Import attributes that need Taichi on first access."""
     if name == "check_gradient":
-        from plab.losses.checking import check_gradient
+        from plab.losses.gradient_check import check_gradient
 
         return check_gradient
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

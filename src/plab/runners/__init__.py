@@ -68,7 +68,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
 
 
 def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
-    """Run configurations that can share a batch; see :func:`plab.sweep.running.plan`.
+    """Run configurations that can share a batch; see :func:`plab.sweep.execution.plan`.
 
     Finished runs, and runs in progress in another process, are skipped.
 

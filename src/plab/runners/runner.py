@@ -268,8 +268,8 @@ class Runner:
     report: Report
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-        """Store the runs, a batch of :func:`plab.sweep.running.plan`, and a text shown before their progress;
-        build nothing yet."""
+        """Store the runs, a batch of :func:`plab.sweep.execution.plan`, and a text shown before their
+        progress; build nothing yet."""
         self.tracks = list(tracks)
         for number, track in enumerate(tracks):
             track.number = number
