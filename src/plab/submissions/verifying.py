@@ -23,7 +23,7 @@ import plab
 from plab.config import Config
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
-from plab.errors import tell
+from plab.errors import print_error
 from plab.render import RenderError, rollouts
 from plab.report.statistics import BUDGETS, load_rows
 from plab.results import ResultsError, Row
@@ -389,7 +389,9 @@ def record(env: Env, folder: str | Path) -> Env:
             return
         if "randomized" in result.info:
             if not told:
-                tell(f"{folder}: randomised episodes are not recorded: evaluate in the task as configured")
+                print_error(
+                    f"{folder}: randomised episodes are not recorded: evaluate in the task as configured"
+                )
             told = True
             return
         # The last steps of a complete episode are the whole episode.
