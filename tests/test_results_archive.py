@@ -156,7 +156,7 @@ def _evaluation(run: RunResult, **values: float) -> RunResult:
 
 BROKEN = {
     "status 'done' is not one of": lambda r: dataclasses.replace(r, status="done"),
-    "config_hash is not that of config": lambda r: dataclasses.replace(r, config_hash="0" * 64),
+    "config_hash does not match config": lambda r: dataclasses.replace(r, config_hash="0" * 64),
     "iterations lack reward": lambda r: dataclasses.replace(
         r, columns={name: values for name, values in r.columns.items() if name != "reward"}
     ),

@@ -56,7 +56,7 @@ def faults(run: RunResult) -> list[str]:
     checks: list[Check] = [
         (run.status in STATUSES, f"status {run.status!r:.80} is not one of {', '.join(STATUSES)}"),
         (partial != (run.status == "finished"), f"the name does not fit the status {run.status}"),
-        (config_hash(run.config) == run.config_hash, "config_hash is not that of config"),
+        (config_hash(run.config) == run.config_hash, "config_hash does not match config"),
     ]
     checks += _iteration_checks(run) if run.rows else []
     checks += _evaluation_checks(run) if run.status == "finished" else []
