@@ -86,6 +86,23 @@ def test_a_row_of_a_batch_is_an_environment_alone(vector) -> None:
     alone.close()
 
 
+def test_pictures_show_the_target_of_a_restored_state() -> None:
+    pytest.importorskip("pyvista")
+    options = {"randomize": {"target": RANGES["target"]}, "render_mode": "rgb_array", "render_target": True}
+    env = plab.make("Move", overrides=[*COARSE, NEAR], render_size=(60, 40), **options).unwrapped
+    env.reset(seed=1)
+    kept, shown = env.get_state(), env.render()
+    env.reset()
+    assert not np.array_equal(env.render(), shown)
+    env.set_state(kept)
+    assert np.array_equal(env.render(), shown)
+    simulator, mass = env.batch.problem.simulator, np.roll(env.batch.problem.target_mass, 9, axis=1)
+    simulator.set_target(mass, mass)
+    env.reset(options={"target.bodies.ball.center": kept.values[0]["target.bodies.ball.center"]})
+    assert not np.array_equal(env.render(), shown)
+    env.close()
+
+
 def test_seeds_and_options(vector) -> None:
     def drawn(**how: object) -> dict[str, np.ndarray]:
         return vector.reset(**how)[1]["randomized"]

@@ -188,6 +188,7 @@ class Problem:
         distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
         self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
         self.simulator.set_target(self.target_mass, np.stack(self._distances))
+        self.target_mass = self.simulator.target_mass
         self.simulator.set_weights({name: weights[name] for name in self.term_names})
         # Generating a target changes the contact model, loading it from the cache does not.
         self.simulator.set_contact("soft")
@@ -237,8 +238,8 @@ class Problem:
             masses, distances = list(self.target_mass), self.distances()
             for e, (mass, distance) in targets.items():
                 masses[e], distances[e] = mass, distance
-            self.target_mass, self._distances = np.stack(masses), distances
-            simulator.set_target(self.target_mass, np.stack(distances))
+            simulator.set_target(np.stack(masses), np.stack(distances))
+            self.target_mass, self._distances = simulator.target_mass, distances
             for e in targets:
                 best = soft_iou(self.target_mass[e], self.target_mass[e])
                 self.initial_scores[e] = replace(self.initial_scores[e], iou_target_self=best)

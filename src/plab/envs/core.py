@@ -353,6 +353,12 @@ class EpisodeBatch:
         known = dict if self.changed_by_hand else self.randomizer.target_observations
         self._observer = Observer(self.problem, self.configs[0], known)
 
+    def _refresh_views(self) -> None:
+        """Update observations and pictures after changes of scenes and targets."""
+        self._close_renderers()
+        self._sensors.refresh()
+        self._new_observer()
+
     @_alone
     def reset(
         self,
@@ -385,8 +391,7 @@ class EpisodeBatch:
             # The caller has changed scenes, targets or initial states.
             self.changed_by_hand = True
             self.problem.refresh()
-            self._new_observer()
-            self._sensors.refresh()
+            self._refresh_views()
             self._observe_starts()
         rows = list(range(self.size) if environments is None else map(int, environments))
         if seeds is not None:
@@ -418,13 +423,11 @@ class EpisodeBatch:
     def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
         """Record the current states as initial states for scores and rewards."""
         self._changes = self._simulator.changes
-        self._close_renderers()
-        self._sensors.refresh()
         self.problem.note_starts(rows, _on_host(iou))
         loss = self._initial_loss.like(None).copy()
         loss[rows] = _on_host(self.problem.loss_of(terms))[rows]
         self._initial_loss = Constants(loss)
-        self._new_observer()
+        self._refresh_views()
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
         """Store observations and measures, as arrays or CUDA tensors, except for some environments."""
@@ -539,7 +542,7 @@ class EpisodeBatch:
             self._changes = self._simulator.changes
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
-            self._new_observer()
+            self._refresh_views()
         for name, value in copy.deepcopy(dict(state.episodes)).items():
             setattr(self, name, value)
         return self._shown()

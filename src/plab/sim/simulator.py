@@ -272,7 +272,8 @@ class Simulator:
         for name, value in held.items():
             require_finite(f"target {name}", value, "node", axes=3)
         self.changes += 1
-        self.target_mass = np.asarray(mass)
+        # A copy, because the caller may modify and pass the same array again.
+        self.target_mass = np.array(mass)
         for name, field in self._engine.references.items():
             self._engine.write(field, held[name])
         for term in self._engine.terms:
