@@ -116,8 +116,20 @@ def test_environments_observe_by_key():
             np.testing.assert_array_equal(values, last[key])
     env.close()
     many.close()
-    alone = plab.make("Move", overrides=COARSE, observe="depth")
-    assert alone.reset()[0].shape == (64, 64, 1)
+    assert plab.make("Move", overrides=COARSE, observe="depth").reset()[0].shape == (64, 64, 1)
+    camera = "+task.cameras.low={position: [0.5,0.9,1.7], target: [0.5,0.2,0.5], size: [32,24], far: 5}"
+    low, options = [*COARSE, camera], {"observe": ["depth", "rgb", "segmentation", "points"]}
+    plain = plab.make("Move", overrides=low, **options).reset()[0]
+    # Targets are not in pictures; points and depths are noisy, except the background.
+    other = [*low, "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"]
+    options |= {"randomize": {"observation_noise": [0.02, 0.02]}}
+    noisy = plab.make("Move", overrides=other, **options).reset(seed=0)[0]
+    for key in ("low_rgb", "low_segmentation"):
+        np.testing.assert_array_equal(noisy[key], plain[key])
+    depths, points = (noisy[key] - plain[key] for key in ("low_depth", "points"))
+    assert plain["low_depth"].shape == (24, 32, 1) and not depths[plain["low_segmentation"] == 0].any()
+    assert 0.018 < depths[plain["low_segmentation"] > 0].std() < 0.022
+    assert 0.018 < points[:, :3].std() < 0.022 and not points[:, 3].any()
     for wrong, named in (({"observe": "sound"}, "sound"), ({"observe": []}, "nothing")):
         with pytest.raises(ValueError, match=named):
             plab.make("Move", overrides=COARSE, **wrong)

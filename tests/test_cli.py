@@ -90,9 +90,6 @@ def test_an_experiment_is_a_sweep(seen):
     assert [cfg.task.yield_stress for cfg in seen] == [10, 20, 50, 100, 200, 1000]
     runs = {(cfg.task.name, cfg.variant, cfg.method.name, cfg.method.episodes) for cfg in seen}
     assert runs == {("Move", "3", "sac", 7)}
-    seen.clear()
-    assert main(["-m", "+experiment=yield_ablation", "task.yield_stress=10,20", "seed=0,1"]) == 0
-    assert [(cfg.task.yield_stress, cfg.seed) for cfg in seen] == [(10, 0), (10, 1), (20, 0), (20, 1)]
 
 
 def failing(error: BaseException) -> Callable[..., float]:

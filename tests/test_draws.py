@@ -92,14 +92,12 @@ def test_pictures_show_the_target_of_a_restored_state() -> None:
     env = plab.make("Move", overrides=[*COARSE, NEAR], render_size=(60, 40), **options).unwrapped
     env.reset(seed=1)
     kept, shown = env.get_state(), env.render()
-    env.reset()
-    assert not np.array_equal(env.render(), shown)
+    assert env.reset() and not np.array_equal(env.render(), shown)
     env.set_state(kept)
     assert np.array_equal(env.render(), shown)
-    simulator, mass = env.batch.problem.simulator, np.roll(env.batch.problem.target_mass, 9, axis=1)
-    simulator.set_target(mass, mass)
-    env.reset(options={"target.bodies.ball.center": kept.values[0]["target.bodies.ball.center"]})
-    assert not np.array_equal(env.render(), shown)
+    mass = np.roll(env.batch.problem.target_mass, 9, axis=1)
+    env.batch.problem.simulator.set_target(mass, mass)
+    assert env.reset(options=kept.values[0]) and not np.array_equal(env.render(), shown)
     env.close()
 
 
