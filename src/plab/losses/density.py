@@ -24,7 +24,7 @@ class Density(NodeTerm):
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Sum the targets' masses, the measure of an empty grid."""
         # Targets of the release may have negative masses.
-        self.sim.write(self.total, np.abs(mass).sum(axis=(1, 2, 3)))
+        self.sim.write(self.total, [np.abs(own).sum() for own in mass])
 
     @ti.func
     def empty(self, e):

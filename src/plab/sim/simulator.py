@@ -276,8 +276,9 @@ class Simulator:
         self.target_mass = np.array(mass)
         for name, field in self._engine.references.items():
             self._engine.write(field, held[name])
+        exact = held["mass"].astype(np.float64)
         for term in self._engine.terms:
-            term.set_target(held["mass"].astype(np.float64), held["sdf"])
+            term.set_target(exact, held["sdf"])
 
     def change_scenes(self, scenes: Sequence[Scene], particles: Mapping[int, np.ndarray]) -> None:
         """Replace all scenes by scenes of the same kind between episodes, without recompilation.
