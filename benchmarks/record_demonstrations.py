@@ -22,7 +22,7 @@ from plab.config.suite import suite_tasks
 from plab.demonstrations import SCORES, known_actions
 from plab.errors import ConfigError
 from plab.render.rollouts import stored
-from plab.results.table import Row, rows
+from plab.results.run_table import Row, rows
 from plab.scenes import Scene
 from plab.targets.scripted import DECIMALS
 

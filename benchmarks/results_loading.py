@@ -23,7 +23,7 @@ from plab.config.selection import Selection
 from plab.report.collect import collect
 from plab.report.writing import write_tables
 from plab.results import load, pack
-from plab.results.table import query, scores
+from plab.results.run_table import query, scores
 from plab.status import survey
 from synthetic_runs import SETTLE, write_runs
 

@@ -47,7 +47,7 @@ def _simulators_of_one_module(request: pytest.FixtureRequest) -> Iterator[None]:
 def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the index of test results out of the user's cache folder."""
     folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setattr("plab.results.table.cache_dir", lambda: folder)
+    monkeypatch.setattr("plab.results.run_table.cache_dir", lambda: folder)
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions, load_actions
 from plab.report.tables import demonstration_scores
 from plab.results import config_dict
-from plab.results.table import rows
+from plab.results.run_table import rows
 from plab.targets import demonstration
 from record_demonstrations import action_names, best_known, save_actions
 from synthetic_runs import synthetic_run

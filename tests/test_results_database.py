@@ -19,7 +19,7 @@ from plab.cli.rollouts import render, resolve_rollout
 from plab.config.selection import Selection
 from plab.report.collect import collect
 from plab.report.statistics import load_series
-from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, table, write
+from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, run_table, write
 from plab.status import survey
 
 
@@ -41,13 +41,13 @@ def age(path: Path, seconds: float = 60.0) -> None:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the files opened."""
     names: list[str] = []
-    read = table.read_rows
+    read = run_table.read_rows
 
     def counting(path: Path):
         names.append(path.name)
         return read(path)
 
-    monkeypatch.setattr(table, "read_rows", counting)
+    monkeypatch.setattr(run_table, "read_rows", counting)
     return names
 
 

@@ -24,7 +24,7 @@ from plab.cli import status
 from plab.config import build_scene, load_config
 from plab.config.families import FAMILIES
 from plab.results import ResultsError, check, read, unpack
-from plab.results.table import read_rows
+from plab.results.run_table import read_rows
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, save_policy
 from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target

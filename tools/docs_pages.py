@@ -78,7 +78,7 @@ PYTHON = {
     "results": (
         "Results",
         "",
-        ("plab.results.table", "plab.results.run_file", "plab.results.run_file", "plab.demonstrations"),
+        ("plab.results.run_table", "plab.results.run_file", "plab.demonstrations"),
     ),
 }
 """Pages of the reference: title, first line, modules."""

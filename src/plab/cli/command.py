@@ -169,7 +169,7 @@ def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     """Return the finished runs of one protocol that match selections; raise ResultsError if there are
     none."""
     from plab.results.run_file import NAMES, ResultsError
-    from plab.results.table import rows
+    from plab.results.run_table import rows
 
     chosen = select(words, NAMES)
     found, _ = rows(sources)

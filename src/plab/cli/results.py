@@ -29,7 +29,7 @@ from plab.errors import print_error
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.run_file import ResultsError
-from plab.results.table import query, rows, scores
+from plab.results.run_table import query, rows, scores
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 

@@ -19,7 +19,7 @@ from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
 from plab.results.run_file import NAMES
-from plab.results.table import sources_of
+from plab.results.run_table import sources_of
 
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that are columns of the table of runs."""

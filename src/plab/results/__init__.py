@@ -29,7 +29,7 @@ from plab.results.running import RunFile, read, write
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack
     from plab.results.checking import check
-    from plab.results.table import Row, connect, load, read_curves, rows
+    from plab.results.run_table import Row, connect, load, read_curves, rows
 
 __all__ = [
     "BUDGETS",
@@ -59,7 +59,7 @@ __all__ = [
 _MODULES = {
     "archive": ("pack", "unpack"),
     "checking": ("check",),
-    "table": ("Row", "connect", "load", "read_curves", "rows"),
+    "run_table": ("Row", "connect", "load", "read_curves", "rows"),
 }
 """Exported names by module, imported on first use."""
 

@@ -21,7 +21,7 @@ import numpy as np
 from plab.config.run import member_name
 from plab.config.selection import Selection
 from plab.results.run_file import ARCHIVE_SUFFIX, ResultsError, RunResult, encode, read, replace_file
-from plab.results.table import Row, rows
+from plab.results.run_table import Row, rows
 
 
 def pack(

@@ -23,7 +23,7 @@ from plab.results.run_file import (
     row_count,
     run_of,
 )
-from plab.results.table import read_each, run_files
+from plab.results.run_table import read_each, run_files
 
 _TOLERANCE = 1e-9
 """Relative tolerance between a score and the IoUs that it is computed from."""

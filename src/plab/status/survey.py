@@ -15,8 +15,8 @@ from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
+from plab.results.run_table import rows
 from plab.results.running import held
-from plab.results.table import rows
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""

@@ -28,8 +28,8 @@ from plab.render import RenderError, rollouts
 from plab.report.statistics import BUDGETS, load_rows
 from plab.results import ResultsError, Row
 from plab.results.run_file import explained, replace_file
+from plab.results.run_table import rows
 from plab.results.running import now
-from plab.results.table import rows
 from plab.submissions.submission import (
     SUFFIX,
     Configuration,
