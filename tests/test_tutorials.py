@@ -115,6 +115,7 @@ def test_environments():
     assert names["infos"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
     assert names["done"].reward.shape == (4,) and names["done"].truncated.all()
+    assert run_page("datasets.md", ("datasets/plab/Move-v0", "example"))["episode"].rewards.size == 50
 
 
 def test_results(monkeypatch, tmp_path):
