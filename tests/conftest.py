@@ -15,6 +15,7 @@ from plab.config import Config
 from plab.runners.runner import Outcome, SimulatorCache
 from plab.sim.runtime import cuda_devices
 from refusals import ending, refusal, snapshot
+from same_runs import SimulatorPool
 from suite import DEVICE
 
 # Let bugs through with their tracebacks, in the processes that tests start, too.
@@ -33,6 +34,16 @@ OF_ANY_DEVICE = (
 def device() -> str:
     """Device of the simulator's tests: ``PLAB_TEST_DEVICE``, by default cpu."""
     return DEVICE
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shared_simulators() -> Iterator[None]:
+    """Let environments and runs of the same kind share simulators."""
+    make = SimulatorPool().make
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("problem", "envs.core", "render.rollouts", "bench.workload"):
+            patch.setattr(f"plab.{module}.make_simulator", make)
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,9 +1,11 @@
-"""Comparison and interruption of runs, for tests of resuming and batching."""
+"""Comparison and interruption of runs, for tests of resuming and batching; simulators shared by all tests."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import gc
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import count
 from typing import Any
 
@@ -12,9 +14,12 @@ import pandas as pd
 import pytest
 
 from plab.config import Config
+from plab.problem import build_scenes, make_simulator
 from plab.results import RunResult, read
 from plab.results.running import RunFile
-from plab.runners.runner import SimulatorCache
+from plab.runners.runner import simulator_key
+from plab.scenes import Scene
+from plab.sim import Simulator
 
 TIMES = ["seconds"]
 """Columns in which two identical runs differ."""
@@ -64,12 +69,30 @@ def stopped_at(call: int, where: Any = RunFile, name: str = "record") -> Iterato
         yield
 
 
-class KeepsAll(SimulatorCache):
-    """Cache of all simulators of a module, because building one takes longer than a run."""
+class SimulatorPool:
+    """Simulators of all tests of a process. One that is no longer used serves the next environment or run of
+    the same kind, because compiling one takes longer than most tests."""
 
-    def get(self, key: Any, build: Callable[[], Any], *, check: Callable[[Any], object]) -> Any:
-        if key in self._kept:
-            check(self._kept[key])
-        else:
-            self._kept[key] = build()
-        return self._kept[key]
+    SIZE = 8
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[Any, Simulator]] = []
+
+    def make(self, cfgs: Any, scenes: Sequence[Scene] | None = None, **options: Any) -> Simulator:
+        """Return an unused simulator with the scenes of some configurations, or a new one."""
+        cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
+        scenes = build_scenes(cfgs) if scenes is None else scenes
+        chosen = sorted((name, repr(value)) for name, value in options.items() if value)
+        key = len(cfgs), simulator_key(cfgs[0], scenes[0]), *chosen
+        same = [simulator for known, simulator in self._kept if known == key]
+        for collect in (bool, gc.collect) if same else ():
+            collect()
+            for simulator in same:
+                # Only the pool, the list, the variable and the argument refer to it.
+                if sys.getrefcount(simulator) == 4:
+                    with suppress(RuntimeError):  # Taichi has been restarted.
+                        simulator.set_scenes(scenes)
+                        return simulator
+        made = make_simulator(cfgs, scenes, **options)
+        self._kept = [*self._kept[1 - self.SIZE :], (key, made)]
+        return made

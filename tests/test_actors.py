@@ -17,10 +17,11 @@ from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.pods import PodsRunner
 from plab.runners.policy import load_policy, policy_path
+from plab.runners.runner import SimulatorCache
 from plab.runners.shac import td_lambda
 from plab.runners.training import DEVIATION_MIN, shared_batches, training_scenes
 from plab.scenes import SceneError
-from same_runs import KeepsAll, finished_as, stopped_at
+from same_runs import finished_as, stopped_at
 from toy_runner import COARSE_32
 
 HORIZON = 5
@@ -45,7 +46,7 @@ METHODS = {
         *("method.updates=3", "method.action_lr=0.05", "method.epochs=2", "method.batch_size=4"),
     ),
 }
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 
 def make_config(folder: Path | str, name: str = "shac", *overrides: str) -> Config:

@@ -15,11 +15,12 @@ from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
 from plab.results import read
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path
-from same_runs import KeepsAll, finished_as, stopped_at
+from plab.runners.runner import SimulatorCache
+from same_runs import finished_as, stopped_at
 from toy_runner import COARSE_32
 
 COARSE = ("observe_particles=5", "observe_target=true", *COARSE_32, "progress=false")
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 
 @pytest.fixture(scope="module")

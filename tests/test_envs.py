@@ -270,10 +270,10 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
         less = [one for one in words if not one.startswith(word)]
         with pytest.raises(ValueError, match=word):
             batch.renew(core.compose_configs("Move", "1", num_envs=2, overrides=less))
-    simulator = weakref.ref(fresh.problem.simulator)
+    problem = weakref.ref(fresh.problem)
     fresh.close()
     fresh.close()
-    assert simulator() is None
+    assert problem() is None
     with pytest.raises(RuntimeError, match="closed"):
         fresh.reset()
     batch.close()

@@ -10,7 +10,8 @@ import pytest
 from plab.config import Config, ConfigError, load_config
 from plab.results import read
 from plab.runners import run_config
-from same_runs import KeepsAll, finished_as, stopped_at
+from plab.runners.runner import SimulatorCache
+from same_runs import finished_as, stopped_at
 from toy_runner import COARSE_32
 
 COARSE = (
@@ -19,7 +20,7 @@ COARSE = (
     "checkpoint_seconds=0", "progress=false",
 )  # fmt: skip
 CEM = ("method.planner.population=4", "method.planner.elites=2")
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 
 def config(folder: Path | str, *words: str) -> Config:

@@ -26,14 +26,14 @@ from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, run_batch, run_config, sb3, training
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path
 from plab.runners.rl import RlRunner, agents_of
-from plab.runners.runner import Outcome, episode_columns
+from plab.runners.runner import Outcome, SimulatorCache, episode_columns
 from plab.runners.sb3 import Sb3Runner
 from plab.runners.training import evaluate, shared_batches
-from same_runs import KeepsAll, finished_as, stopped_at
+from same_runs import finished_as, stopped_at
 from suite import make_not_finite
 from toy_runner import COARSE_32
 
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 HORIZON = 4
 

@@ -12,10 +12,11 @@ from plab.config import Config, load_config
 from plab.problem import Problem
 from plab.results import RunResult, read
 from plab.runners import run_batch, run_config
-from same_runs import KeepsAll, finished_as, stopped_at
+from plab.runners.runner import SimulatorCache
+from same_runs import finished_as, stopped_at
 from toy_runner import COARSE
 
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 RUNS = (
     ("variant=1",),

@@ -19,7 +19,8 @@ import synthetic
 from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
-from same_runs import KeepsAll, stopped_at
+from plab.runners.runner import SimulatorCache
+from same_runs import stopped_at
 from toy_runner import COARSE, COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,7 +28,7 @@ DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 # Run in a copy of plab that has the disc: gradients must be what differences are.
 DISC = """
