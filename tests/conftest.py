@@ -15,7 +15,7 @@ from plab.config import Config
 from plab.runners.runner import Outcome, SimulatorCache
 from plab.sim.runtime import cuda_devices
 from refusals import ending, refusal, snapshot
-from same_runs import SimulatorPool
+from same_runs import shared_simulator
 from suite import DEVICE
 
 # Let bugs through with their tracebacks, in the processes that tests start, too.
@@ -39,10 +39,9 @@ def device() -> str:
 @pytest.fixture(scope="session", autouse=True)
 def _shared_simulators() -> Iterator[None]:
     """Let environments and runs of the same kind share simulators."""
-    make = SimulatorPool().make
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("problem", "envs.core", "render.rollouts", "bench.workload"):
-            patch.setattr(f"plab.{module}.make_simulator", make)
+        for name in ("problem", "envs.core", "render.rollouts", "bench.workload"):
+            patch.setattr(f"plab.{name}.make_simulator", shared_simulator)
         yield
 
 
@@ -89,6 +88,15 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     monkeypatch.setattr("plab.runners.run_config", collect)
     monkeypatch.setattr("plab.runners.run_batch", collect_batch)
     return configs
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch, recording: object) -> list[tuple]:
+    """Use the module's recording instead of simulations; return what was to be simulated."""
+    asked: list[tuple] = []
+    for name in ("record", "record_with_motion"):
+        monkeypatch.setattr(f"plab.render.rollouts.{name}", lambda *given: asked.append(given) or recording)
+    return asked
 
 
 @pytest.fixture

@@ -69,30 +69,23 @@ def stopped_at(call: int, where: Any = RunFile, name: str = "record") -> Iterato
         yield
 
 
-class SimulatorPool:
-    """Simulators of all tests of a process. One that is no longer used serves the next environment or run of
-    the same kind, because compiling one takes longer than most tests."""
+SIMULATORS: list[tuple[Any, Simulator]] = []
+"""The last simulators, by kind; compiling one takes longer than most tests."""
 
-    SIZE = 8
 
-    def __init__(self) -> None:
-        self._kept: list[tuple[Any, Simulator]] = []
-
-    def make(self, cfgs: Any, scenes: Sequence[Scene] | None = None, **options: Any) -> Simulator:
-        """Return an unused simulator with the scenes of some configurations, or a new one."""
-        cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
-        scenes = build_scenes(cfgs) if scenes is None else scenes
-        chosen = sorted((name, repr(value)) for name, value in options.items() if value)
-        key = len(cfgs), simulator_key(cfgs[0], scenes[0]), *chosen
-        same = [simulator for known, simulator in self._kept if known == key]
-        for collect in (bool, gc.collect) if same else ():
-            collect()
-            for simulator in same:
-                # Only the pool, the list, the variable and the argument refer to it.
-                if sys.getrefcount(simulator) == 4:
-                    with suppress(RuntimeError):  # Taichi has been restarted.
-                        simulator.set_scenes(scenes)
-                        return simulator
-        made = make_simulator(cfgs, scenes, **options)
-        self._kept = [*self._kept[1 - self.SIZE :], (key, made)]
-        return made
+def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options: Any) -> Simulator:
+    """Return a simulator as :func:`plab.problem.make_simulator` does, reusing one that nobody refers to."""
+    cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
+    scenes = build_scenes(cfgs) if scenes is None else scenes
+    key = len(cfgs), simulator_key(cfgs[0], scenes[0]), repr({k: v for k, v in options.items() if v})
+    same = [simulator for known, simulator in SIMULATORS if known == key]
+    for collect in (bool, gc.collect) if same else ():
+        collect()
+        for simulator in same:
+            # Only both lists, the variable and the argument refer to it.
+            if sys.getrefcount(simulator) == 4:
+                with suppress(RuntimeError):  # Taichi has been restarted.
+                    simulator.set_scenes(scenes)
+                    return simulator
+    SIMULATORS[:] = [*SIMULATORS[-7:], (key, make_simulator(cfgs, scenes, **options))]
+    return SIMULATORS[-1][1]

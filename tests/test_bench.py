@@ -12,8 +12,6 @@ from plab.bench import speed, stability, unseen, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
 from toy_runner import COARSE_32
 
-TINY = COARSE_32
-
 
 def read(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
@@ -27,7 +25,7 @@ def test_speed_prints_and_writes_complete_rows(
     monkeypatch.setattr(
         speed, "build", lambda *args: loads[-1] if loads else loads.append(workload.build(*args)) or loads[-1]
     )
-    command = [*TINY, "--steps", "2", "--repeats", "1", "--batch", "2", "--csv", str(path)]
+    command = [*COARSE_32, "--steps", "2", "--repeats", "1", "--batch", "2", "--csv", str(path)]
     assert speed.main([*command, "--kinds", FORWARD, ROLLOUT]) == 0
     rows = read(path)
     assert [(row["batch"], row["what"]) for row in rows] == [("2", FORWARD), ("2", ROLLOUT)]
@@ -55,7 +53,17 @@ def still(observation: np.ndarray) -> np.ndarray:
 
 def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
     table = tmp_path / "unseen.csv"
-    words = [*TINY, "task=Move", "sim.horizon=3", "--scenes", "3", "--together", "2", "--csv", str(table)]
+    words = [
+        *COARSE_32,
+        "task=Move",
+        "sim.horizon=3",
+        "--scenes",
+        "3",
+        "--together",
+        "2",
+        "--csv",
+        str(table),
+    ]
     assert unseen.main([*words, "--policy", "test_bench:still"]) == 0
     (row,) = read(table)
     assert (row["policy"], row["scenes"]) == ("test_bench:still", "3") and float(row["score"]) < 0.05

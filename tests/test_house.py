@@ -1,16 +1,14 @@
-"""Layering of packages, imports of the command lines, and public names."""
+"""Imports of the command lines, and public names."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import plab
 
-ROOT = Path(__file__).parents[1]
 HEAVY = {"matplotlib", "pandas", "pyvista", "scipy.ndimage", "stable_baselines3", "taichi", "torch", "vtk"}
 
 STARTING = """
@@ -34,12 +32,6 @@ assert RunFile(cfg).result.score == 0.5
 """
 
 TABLES = "from plab.cli.report import main; assert main(['tables', 'example']) == 0"
-
-
-def test_imports_point_one_way(monkeypatch):
-    cli = pytest.importorskip("importlinter.cli")
-    monkeypatch.chdir(ROOT)
-    assert cli.lint_imports(no_cache=True) == cli.EXIT_STATUS_SUCCESS
 
 
 @pytest.mark.parametrize(

@@ -267,19 +267,6 @@ def test_missing_packages_and_drivers_are_named(monkeypatch, told):
     graphics.missing_graphics.cache_clear()
 
 
-@pytest.fixture
-def replayed(monkeypatch, recording) -> list:
-    """Use a recording instead of a simulation; return the requested rollouts."""
-    asked = []
-
-    def stand_in(cfg, actions):
-        asked.append((cfg, actions))
-        return recording
-
-    monkeypatch.setattr("plab.render.rollouts.record", stand_in)
-    return asked
-
-
 def test_the_best_actions_of_a_result_are_replayed_as_a_strip(capsys, replayed, told):
     cfg = load_config(["task=Rope", "variant=2", "seed_particles=3", *COARSE])
     found = results.RunResult(results.config_dict(cfg), cfg.hash)

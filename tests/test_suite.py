@@ -46,12 +46,6 @@ def check_steps(task: Problem, actions: np.ndarray) -> None:
     np.testing.assert_allclose(task.target_mass.sum(axis=(1, 2, 3)), total, rtol=1e-5)
 
 
-def test_chopsticks_step_score_and_differentiate(device):
-    """Test the manipulator with most degrees of freedom, with a tenth of the particles."""
-    batch, actions = problem("Chopsticks", ("1", "4"), "sim.particles_scale=0.1", f"sim.device={device}")
-    check_steps(batch, actions[:, :3])
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_all_configurations_step_score_and_differentiate(task, device):

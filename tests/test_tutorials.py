@@ -13,13 +13,10 @@ from typing import Any
 
 import pytest
 
-import plab.problem
-import plab.sim
 import synthetic
 from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
-from plab.runners.runner import SimulatorCache
 from same_runs import stopped_at
 from toy_runner import COARSE, COARSE_32
 
@@ -28,7 +25,6 @@ DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
-CACHE = SimulatorCache()
 
 # Run in a copy of plab that has the disc: gradients must be what differences are.
 DISC = """
@@ -62,7 +58,7 @@ def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Compose coarse configurations on the CPU; keep simulators between pages."""
+    """Compose coarse configurations on the CPU."""
 
     def coarse(overrides: Sequence[str] = (), config_dir: str | None = None) -> Config:
         words = [word for word in overrides if word != "sim.device=cuda"]
@@ -70,16 +66,9 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         less = (word for word in COARSE_32 if word.partition("=")[0] not in given)
         return load_config([*words, *less], config_dir)
 
-    def kept(scenes: Sequence[Any], terms: Sequence[Any], **options: Any) -> plab.sim.Simulator:
-        key = repr((scenes, [term.name for term in terms], sorted(options.items())))
-        return CACHE.get(key, lambda: build(scenes, terms=terms, **options), check=build.state)
-
-    build = plab.sim.Simulator
     monkeypatch.chdir(tmp_path)
     for module in ("plab.config", "plab.envs.core"):
         monkeypatch.setattr(f"{module}.load_config", coarse)
-    for module in ("plab.sim", "plab.problem"):
-        monkeypatch.setattr(f"{module}.Simulator", kept)
 
 
 FEWER = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
@@ -172,7 +161,7 @@ def test_a_method_of_ones_own(tmp_path):
 def test_an_interrupted_search_goes_on(tmp_path):
     def result(folder: str) -> RunResult:
         words = [*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"]
-        run_config(load_config(words, SEARCH[1]), CACHE)
+        run_config(load_config(words, SEARCH[1]))
         (path,) = (tmp_path / folder).rglob("*.h5")
         return read(path)
 

@@ -130,20 +130,7 @@ def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
 # ------------------------------------------------------------------------------- command line and notebook
 
 
-@pytest.fixture
-def simulated(monkeypatch, recording) -> list:
-    """Use a recording instead of a simulation; return the requested rollouts."""
-    asked = []
-
-    def stand_in(cfg, actions):
-        asked.append((cfg, actions))
-        return recording
-
-    monkeypatch.setattr("plab.render.rollouts.record_with_motion", stand_in)
-    return asked
-
-
-def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, simulated, page):
+def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, replayed, page):
     cfg = load_config(["task=Rope", "variant=2", *COARSE])
     numbers = {"status": "finished", "best_actions": ACTIONS}
     path = cfg.path
@@ -158,20 +145,20 @@ def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, 
         assert main([str(source)]) == 0
         assert capsys.readouterr() == (f"{shown}\n", "")
         assert shown.read_text(encoding="utf-8") == page
-    for replay, given in simulated:
+    for replay, given in replayed:
         assert np.array_equal(given, ACTIONS) and replay.variant == "2"
 
 
-def test_the_gallery_has_a_page_of_every_task(monkeypatch, simulated, page, capsys):
+def test_the_gallery_has_a_page_of_every_task(monkeypatch, replayed, page, capsys):
     monkeypatch.setattr("plab.view.page.page", lambda *_, **__: page)
     assert main(["--gallery"]) == 0 and capsys.readouterr().out.endswith("gallery/index.html\n")
     index = Path("gallery/index.html").read_text(encoding="utf-8")
     names = [f"{task}-v1.html" for task in suite_tasks()]
-    assert re.findall('href="([^"]*)"', index) == names and len(simulated) == 10
+    assert re.findall('href="([^"]*)"', index) == names and len(replayed) == 10
     assert all(Path("gallery", name).read_text(encoding="utf-8") == page for name in names)
 
 
-def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulated, recording, page):
+def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(replayed, recording, page):
     cfg = load_config(["task=Rope", "variant=2", *COARSE])
     view = show(cfg, ACTIONS, height=300)
     assert (view.page, view.score) == (page, recording.score)
@@ -182,8 +169,8 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulat
     results.write(found, Path("seed0.h5"))
     show("seed0.h5")
     show(cfg)
-    assert all(one.variant == "2" for one, _ in simulated)
-    for (_, given), expected in zip(simulated, (ACTIONS, ACTIONS, known_actions(cfg)), strict=True):
+    assert all(one.variant == "2" for one, _ in replayed)
+    for (_, given), expected in zip(replayed, (ACTIONS, ACTIONS, known_actions(cfg)), strict=True):
         assert np.array_equal(given, expected)
     with pytest.raises(graphics.RenderError, match="own actions"):
         show("seed0.h5", ACTIONS)

@@ -17,6 +17,7 @@ from plab.results import RunFile
 from plab.results import read as read_result
 from plab.sim import compiler
 from plab.sim.compiler import watch_compiling
+from same_runs import make_simulator
 
 COARSE = ("sim.grid_size=16", "sim.horizon=2", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -44,6 +45,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
             yield
 
     monkeypatch.setattr("plab.sim.compiler.watch_compiling", watch)
+    monkeypatch.setattr("plab.problem.make_simulator", make_simulator)  # a new one
     monkeypatch.setattr(RunFile, "record", look)
     monkeypatch.chdir(tmp_path)
     argv = ["task=Rope", *COARSE, "method.iterations=3", "checkpoint_seconds=1e6"]
