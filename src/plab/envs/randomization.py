@@ -58,7 +58,9 @@ class _Base:
     def target_observation(self) -> np.ndarray:
         """Observation of the target in the initial state, shape [14]."""
         scene = self.scene
-        mass = spread_mass(self.particles, scene.grid_size, scene.particle_mass, scene.floor_stencil)
+        # Rounded as in the simulator, so that the result is the same as from its initial state.
+        x = self.particles.astype(self.cfg.sim.precision).astype(np.float64)
+        mass = spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor_stencil)
         return target_observation(mass, self.target[0])
 
 

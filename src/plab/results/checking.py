@@ -64,7 +64,7 @@ def faults(run: RunResult) -> list[str]:
 
 
 Check: TypeAlias = tuple[Any, str]
-"""Whether a requirement is met, and the fault to report otherwise."""
+"""A requirement: True if met, and the fault to report if not."""
 
 
 def _iteration_checks(run: RunResult) -> list[Check]:
