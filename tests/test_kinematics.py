@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from scipy.spatial.transform import Rotation
 
 import plab
@@ -29,6 +28,7 @@ from plab.scenes import Body, Manipulator, Scene, SceneError, link_manipulators
 from plab.sim import Simulator
 
 mujoco = pytest.importorskip("mujoco")
+trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("gymnasium_robotics")
 
 STEPS = 3

@@ -28,7 +28,7 @@ for k, (name, label) in enumerate(LABELS.items()):
     axes.bar(places, rows.score, 0.19, label=label, color=method(name).colour)
     errors = np.abs(rows[["lower", "upper"]].to_numpy().T - rows.score.to_numpy())
     axes.errorbar(places, rows.score, errors, fmt="none", ecolor="#333333", elinewidth=1, capsize=2)
-axes.set(ylabel="score in 100 unseen scenes", ylim=(0, 1), xlim=(-0.6, len(tasks) - 0.4))
+axes.set(ylabel="score in unseen scenes", ylim=(0, 1), xlim=(-0.6, len(tasks) - 0.4))
 axes.set_xticks(range(len(tasks)), tasks, fontsize=8.5)
 axes.spines[["top", "right"]].set_visible(False)
 axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
