@@ -42,6 +42,9 @@ UNREACHED_COST = 100.0
 OVERSHOOT = (0.5, 1.5)
 """Range of the pushing distance, relative to the displacement of the pushed point."""
 
+REACH = (0.3, 1.0)
+"""Range of the displacement of an articulated model's base, relative to the way of a link to a point."""
+
 
 class ContactStarts:
     """Initial action sequences for a scene and its target."""
@@ -59,19 +62,27 @@ class ContactStarts:
         )
 
     def _with_joints(self, own: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Append the actions of the articulated model, if any: two uniform motions of all joints. In the
-        second motion, a movable base follows the mean displacement of the bodies."""
+        """Append the actions of the articulated model, if any: two uniform motions.
+
+        A movable base first moves a random link towards a random point of a body, then follows the mean
+        displacement of the bodies. The other joints move by a random common amount, as in closing a hand,
+        plus individual ones.
+        """
         chain, steps = self._scene.kinematics, self._scene.horizon
         if chain is None:
             return own
         first = max(1, int(steps * rng.uniform(0.3, 0.6)))
-        rows = rng.uniform(-1.0, 1.0, (2, len(chain.components)))
-        way = np.median(self._transport[1], axis=0)
+        count = len(chain.components)
+        rows = rng.uniform(-1.0, 1.0, (2, 1)) + rng.uniform(-1.0, 1.0, (2, count)) * rng.uniform(size=(2, 1))
+        rows *= rng.uniform(size=(2, 1)) ** 2
+        points, ways, _ = self._transport
+        links = chain.frames([joint.start for joint in chain.joints])[:, :3, 3]
+        reach = rng.choice(points) - rng.choice(links)
+        motions = (rng.uniform(*REACH) * reach / first, np.median(ways, axis=0) / (steps - first or 1))
         for joint in chain.joints:
             if joint.name in ("base_x", "base_y", "base_z"):
-                rows[1, joint.component] = (
-                    way["xyz".index(joint.name[-1])] / joint.scale / (steps - first or 1)
-                )
+                axis = "xyz".index(joint.name[-1])
+                rows[:, joint.component] = [way[axis] / joint.scale for way in motions]
         moved = np.repeat(rows, [first, steps - first], axis=0)
         return np.concatenate([own, np.clip(moved, -1.0, 1.0)], axis=1)
 

@@ -546,7 +546,11 @@ class Scene:
         for number, body in enumerate(self.bodies):
             self._validate_body(f"bodies[{number}]", body)
         count = len(self.manipulators)
-        _require(count <= MANIPULATORS_MAX, f"{count} manipulators are more than {MANIPULATORS_MAX}")
+        _require(
+            count <= MANIPULATORS_MAX,
+            f"{count} manipulators are more than {MANIPULATORS_MAX}: leave some out, "
+            "or links of the articulated model by kinematics.omit",
+        )
         if self.kinematics is not None:
             self._require_slow("kinematics", self.kinematics.largest_step())
         for number, manipulator in enumerate(self.manipulators):
