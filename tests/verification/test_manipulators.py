@@ -17,6 +17,7 @@ import pytest
 import torch
 
 import reference_mpm as reference
+from plab.envs.autograd import simulate
 from plab.losses import make_terms
 from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator, State
@@ -340,6 +341,39 @@ def test_gradients_by_actions_state_and_material_in_every_regime(touched: Simula
             )
     check_slopes(touched, ways)
     assert material[2] < math.inf or material_bar[2] == 0.0
+
+
+@pytest.mark.parametrize("every_step", [True, False])
+def test_functions_of_states_are_differentiated(every_step: bool, touched: Simulator) -> None:
+    """Compare derivatives by actions, positions and material of two environments with central differences."""
+    simulator, kinds = touched, ("Sphere", "RollingPin", "Chopsticks", "Box", "Cylinder")
+    simulator.set_scenes([scene(kinds), scene(("Sphere", "Chopsticks")), *SCENES[2:]])
+    rng = np.random.default_rng(0)
+    values = {
+        "u": torch.tensor(rng.uniform(-0.9, 0.9, (BATCH, 3, simulator.action_dim)), requires_grad=True),
+        "x": torch.tensor(simulator.state().x, requires_grad=True),
+        "material": torch.tensor([[5000.0, 0.2, 50.0]] * BATCH, dtype=torch.float64, requires_grad=True),
+    }
+    random = torch.Generator().manual_seed(0)
+    masks: list[torch.Tensor] = []
+
+    def function(u: torch.Tensor, x: torch.Tensor, material: torch.Tensor) -> torch.Tensor:
+        states = simulate(simulator, u, x=x, material=material, every_step=every_step)
+        x, v, poses, mass = parts = [part[:2] for part in states]
+        if not masks:
+            masks.extend(torch.rand(part.shape, generator=random, dtype=torch.float64) for part in parts)
+        parts = x**2, 1e-2 * v, poses, 1e3 * mass
+        return sum((part * mask).sum() for part, mask in zip(parts, masks, strict=True))
+
+    gradients = torch.autograd.grad(function(**values), list(values.values()))
+    widths = {"u": 1e-5, "x": 1e-6, "material": torch.tensor([1e-2, 1e-6, 1e-4], dtype=torch.float64)}
+    for (name, value), gradient in zip(values.items(), gradients, strict=True):
+        way = torch.tensor(rng.normal(size=value.shape)) * widths[name]
+        with torch.no_grad():
+            ends = [function(**(values | {name: value + sign * way})) for sign in (1, -1)]
+        want, got = float(ends[0] - ends[1]) / 2, float((gradient * way).sum())
+        assert got == pytest.approx(want, rel=2e-6), name
+    simulator.set_scenes(SCENES)
 
 
 def check_corner(sim: Simulator, way: Way, exact: float) -> None:

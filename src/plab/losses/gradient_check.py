@@ -45,10 +45,21 @@ def check_gradient(
         ValueError: If the measure does not depend on the state.
     """
     term.weight = term.weight or 1.0
-    rng = np.random.default_rng(seed)
     simulator = Simulator(scenes, terms=(term,), precision="float64", device=device)
+    return gradient_errors(simulator, term, directions=directions, seed=seed)
+
+
+def gradient_errors(
+    simulator: Simulator, term: Term, *, directions: int = 4, seed: int = 0
+) -> dict[str, float]:
+    """Return the errors of :func:`check_gradient` for one of a simulator's terms; changes its state, targets
+    and weights."""
+    rng = np.random.default_rng(seed)
+    column = simulator.terms.index(term)
+    simulator.set_weights({other.name: term.weight * (other is term) for other in simulator.terms})
+    scene = simulator.scenes[0]
     shape = (simulator.batch, *[simulator.grid_size] * 3)
-    simulator.set_target(scenes[0].particle_mass * rng.random(shape), rng.random(shape))
+    simulator.set_target(scene.particle_mass * rng.random(shape), rng.random(shape))
     start = _disturbed(simulator, rng)
     simulator.set_state(start)
     gradient = simulator.loss_gradient()
@@ -57,13 +68,13 @@ def check_gradient(
     def loss(part: str, shift: np.ndarray) -> float:
         """Loss of all environments with one part of the state shifted."""
         simulator.set_state(replace(start, **{part: getattr(start, part) + shift}))
-        return float(simulator.losses().sum()) * term.weight
+        return float(simulator.losses()[:, column].sum()) * term.weight
 
     for part in ("x", "v", "poses"):
         for _ in range(directions):
             way = rng.normal(size=getattr(start, part).shape)
             if part == "poses":
-                way *= _free(scenes[0])
+                way *= _free(scene)
             ends = [loss(part, sign * STEP * way) for sign in (1, -1)]
             pair = (ends[0] - ends[1]) / (2 * STEP), float((getattr(gradient, part) * way).sum())
             slopes.setdefault(part, []).append(pair)
