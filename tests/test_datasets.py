@@ -20,17 +20,18 @@ from same_runs import finished_as, stopped_at
 from toy_runner import COARSE_32
 
 COARSE = ("observe_particles=5", "observe_target=true", *COARSE_32, "progress=false")
+SEARCH = ("method=cem", "method.population=4", "method.elites=2", "method.iterations=2")
 CACHE = SimulatorCache()
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with a dataset of random scenes, solved by two updates, with images."""
+    """Folder with a dataset of random scenes, solved by a short search, with images."""
     folder = tmp_path_factory.mktemp("datasets")
     (folder / "cameras.yaml").write_text(
         "top: {position: [0.5, 2, 0.5], target: [0.5, 0, 0.5], size: [8, 4]}"
     )
-    words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "method=adam", "method.iterations=2"]
+    words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", *SEARCH]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder
@@ -45,7 +46,7 @@ def test_an_episode_is_what_its_environment_gives(written: Path) -> None:
     first, *others = read_episodes(written / "plab/Move-v0")
     variants = [one.attributes["variant"] for one in (first, *others)]
     assert variants == ["random1000", "random1001", "random1003"]
-    assert first.attributes["source"] == "adam" and first.observations["top_depth"].shape == (51, 4, 8, 1)
+    assert first.attributes["source"] == "cem" and first.observations["top_depth"].shape == (51, 4, 8, 1)
     steps = [(env.reset()[0], 0.0), *(env.step(action)[:2] for action in first.actions)]
     for key in ("state", "top_depth"):
         assert np.array_equal(np.stack([seen[key] for seen, _ in steps]), first.observations[key])
@@ -67,8 +68,7 @@ def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> None:
     ranges = ["yield_stress=[20,200]", "bodies.ball.offset=[[0,0,0],[0.02,0,0]]", "scenes=2"]
-    words = ["task=Move", "variant=random", "seed_scene=1000", "seed=0,1"]
-    words += ["method=adam", "method.iterations=2"]
+    words = ["task=Move", "variant=random", "seed_scene=1000", "seed=0,1", *SEARCH]
     drawn = [f"+task.randomize.{one}" for one in ranges]
     assert main([*words, *drawn, f"results_dir={tmp_path}", *COARSE, "--output", str(tmp_path)]) == 0
     kwargs = json.loads(metadata_of(tmp_path / "plab/Move-v0")["env_spec"])["kwargs"]

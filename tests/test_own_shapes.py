@@ -91,7 +91,8 @@ def test_runs_of_each_kind_of_target_are_read_without_the_files(files, tmp_path,
     shutil.copytree(files, tmp_path, dirs_exist_ok=True)
     shutil.copytree(CONF, tmp_path / "own" / "conf")
     np.save("mass.npy", spread_mass(np.load("cloud.npy"), 16, 1.0))
-    run = ["--config-dir", "own/conf", "task=Star", *QUICK, "method.iterations=2", "progress=false"]
+    method = ["method=cem", "method.population=4", "method.elites=2", "method.iterations=2"]
+    run = ["--config-dir", "own/conf", "task=Star", *QUICK, *method, "progress=false"]
     assert main(["-m", *run, "variant=1,2,3"]) == 0
     (reached,) = blocks("python")
     exec(reached, {})

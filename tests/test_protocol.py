@@ -22,6 +22,7 @@ from plab.sim import Simulator
 from plab.sweep.execution import plan
 from plab.targets import TargetError
 from suite import CENTER, assert_same_state, reference_state, scene, tools
+from toy_runner import COARSE
 
 WEIGHTS = (10.0, 10.0, 1.0)
 TERMS = dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True))
@@ -194,8 +195,8 @@ def test_overrides_mistakes_and_batches_of_one_protocol() -> None:
 def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
     folder, results = tmp_path / "files", tmp_path / "results"
     words = ["task=Torus", "protocol=release", f"targets.source={folder}", f"results_dir={results}"]
-    words += ["sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2"]
-    words += ["sim.particles_scale=0.03", "method.iterations=1", f"sim.device={device}"]
+    words += [*COARSE, f"sim.device={device}"]
+    words += ["method=cem", "method.iterations=1", "method.population=4", "method.elites=2"]
     cfg = load_config(words)
     world = build_scene(cfg)
     folder.mkdir()

@@ -71,7 +71,7 @@ def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
 def test_dropped_simulators_free_their_fields_beside_another() -> None:
     scene = build_scene(load_config(["task=Move", "sim.particles_scale=0.02"]))
     kept, resident = Simulator([scene]), []
-    for _ in range(6):
+    for _ in range(5):
         Simulator([scene])
         with open("/proc/self/statm") as file:
             resident.append(int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6)

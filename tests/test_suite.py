@@ -77,7 +77,7 @@ def test_thin_manipulators_are_warned_of(caplog) -> None:
     """The warning gives number and thickness of manipulators that fit between two nodes."""
     for radius, lines in ((0.01, 1), (0.02, 0)):
         caplog.clear()
-        Problem([load_config(["task=Pinch", *COARSE, f"task.manipulators.ball.size=[{radius}]"])])
+        Problem([load_config(["task=Rope", *COARSE, f"task.manipulators.left.size=[{radius}]"])])
         found = [line for line in caplog.messages if "passes through bodies" in line]
         assert len(found) == lines
         assert all(line.startswith("manipulators[0] is 0.02 thin") for line in found)
