@@ -14,25 +14,16 @@ from plab.envs.autograd import policy_gradient, rollout, simulate
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
+from toy_runner import COARSE_ROPE
 
 HORIZON = 3
-COARSE = [
-    "task=Rope",
-    "sim.grid_size=16",
-    f"sim.horizon={HORIZON}",
-    "sim.substeps=5",
-    "sim.dt=4e-4",
-    "sim.particles_scale=0.03",
-    "task.manipulators.left.size=[0.06]",
-    "task.manipulators.left.position=[0.25,0.0625,0.75]",
-]
 
 
 @pytest.fixture(scope="module")
 def episodes() -> EpisodeBatch:
     """Two environments, the second with a softer rope; the target is observed."""
-    first = load_config([*COARSE, "sim=reference", "observe_target=true"])
-    second = load_config([*COARSE, "sim=reference", "observe_target=true", "task.yield_stress=20"])
+    first = load_config([*COARSE_ROPE, "observe_target=true"])
+    second = load_config([*COARSE_ROPE, "observe_target=true", "task.yield_stress=20"])
     return EpisodeBatch([first, second], contact="soft")
 
 

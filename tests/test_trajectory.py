@@ -24,26 +24,13 @@ from plab.runners.training import shared_batches
 from plab.runners.trajectory import UpdateRule
 from plab.sim import SimulationError, Simulator
 from same_runs import assert_same_numbers, finished_as, stopped_at
+from toy_runner import COARSE_ROPE
 
 CACHE = SimulatorCache()
 
 ITERATIONS = 4
 
-COARSE = (
-    "task=Rope",
-    "sim=reference",
-    "sim.grid_size=16",
-    "sim.horizon=3",
-    "sim.substeps=5",
-    "sim.dt=4e-4",
-    "sim.particles_scale=0.03",
-    "task.manipulators.left.size=[0.06]",
-    "task.manipulators.left.position=[0.25,0.0625,0.75]",
-    f"method.iterations={ITERATIONS}",
-    "progress=false",
-)
-"""300 particles, 15 substeps. The left sphere, of almost a cell's radius, sits on a node in the rope: the
-nodes around it are within reach of the soft contact model, but not of the hard one."""
+COARSE = (*COARSE_ROPE, f"method.iterations={ITERATIONS}", "progress=false")
 
 
 def make_config(folder: Path, *overrides: str) -> Config:
@@ -61,9 +48,6 @@ def run(cfg: Config) -> RunResult:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """Uninterrupted run."""
     return run(make_config(tmp_path_factory.mktemp("results")))
-
-
-# ---------------------------------------------------------------- update rules
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +101,6 @@ def test_no_better_score_is_given_up() -> None:
             finalists.keep_best()
             finalists = trajectory.Finalists.of(finalists.state())
         assert not shown or finalists.kept_score == max(shown)
-
-
-# ---------------------------------------------------------------- whole runs
 
 
 def test_file_holds_the_whole_run(finished: RunResult) -> None:
@@ -210,9 +191,6 @@ def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
     assert get("a") == 4
 
 
-# ---------------------------------------------------------------- interruptions, failures
-
-
 def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: BaseException) -> None:
     """Raise an error at a rollout, counted from 0."""
     intact, calls = where.rollout, iter(range(1_000))
@@ -259,9 +237,6 @@ def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: t
     left = read(cfg.path.with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", str(caught.value), 2)
     assert left.best_actions is not None
-
-
-# ---------------------------------------------------------------- logs
 
 
 def assert_rows_are_shown(result: RunResult) -> None:
@@ -324,9 +299,6 @@ def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatc
     quiet = RunLog(replace(cfg, logger="none"), run)
     quiet.write({"loss": 1.0}, 0)
     assert not quiet.wanted and len(began) == 2
-
-
-# ---------------------------------------------------------------- policies: apg
 
 
 APG = ("method=apg", "method.hidden=[16,16]", "method.lr=0.01")

@@ -22,6 +22,10 @@ from plab.runners.runner import RunError, Track
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 COARSE_32 = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
 """Resolutions of the tests' tasks: a kernel is compiled for the time step, substeps, nodes and particles."""
+COARSE_ROPE = ("task=Rope", "sim=reference", *COARSE, "task.manipulators.left.size=[0.06]")
+COARSE_ROPE += ("task.manipulators.left.position=[0.25,0.0625,0.75]",)
+"""300 particles, 15 substeps. The left sphere, of almost a cell's radius, sits on a node in the rope: the
+nodes around it are within reach of the soft contact model, but not of the hard one."""
 
 ITERATIONS = 12
 PAUSE = 0.0
