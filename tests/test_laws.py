@@ -4,6 +4,7 @@ import ctypes
 import dataclasses
 import math
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import laws
-from plab.config import build_scene, load_config
+from plab.config import ConfigError, build_scene, load_config
 from plab.laws import Law
 from plab.scenes import LAWS, Body, Material, Scene, find_law
 from plab.sim import DeviceError, Simulator
@@ -308,10 +309,25 @@ def test_compiled_laws_are_kept_in_the_cache(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "file"))
     other = Path(bitcode.bitcode_file.__wrapped__(*given))
     assert other != path and other.name == path.name and other.exists()
-    other.unlink()
-    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
-    with pytest.raises(DeviceError, match="llvmlite"):
-        bitcode.bitcode_file.__wrapped__(*given)
+    # Without llvmlite, a simulator says so before Taichi compiles a kernel; likewise for a law's mistakes.
+    shutil.rmtree(other.parent)
+    bitcode.bitcode_file.cache_clear()
+    monkeypatch.syspath_prepend(tmp_path)
+    line = "{0} = replace(ELASTIC, name='{0}', update=lambda c, f, *_: ([{1}] * 6, f))\n"
+    text = "from dataclasses import replace\nimport numpy as np\nfrom plab.laws.elastic import ELASTIC\n"
+    text += line.format("A", "1.0 if c[0] < 0.0 else 2.0") + line.format("B", "np.arctan(c[0])")
+    (tmp_path / "wrong.py").write_text(text)
+    for law, kind, named in (
+        ("wrong:A", ConfigError, r"law A of \S+wrong.py cannot .* use np.where"),
+        ("wrong:B", ConfigError, "np.arctan of a component"),
+        ("elastic", DeviceError, "compiles its laws with llvmlite"),
+    ):
+        if law == "elastic":
+            monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+        with pytest.raises(kind, match=named):
+            Simulator(
+                [Scene("one", (Body("sphere", (0.5,) * 3, (0.1,), 9, law=law),), ())], precision="float64"
+            )
 
 
 def test_many_threads_add_to_numbers_of_a_field() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen"]
+__all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen", "require_supported"]
 
 Number = Any
 """A node or a constant."""
@@ -73,20 +73,32 @@ class Node:
     def __gt__(self, other: Number) -> Node:
         return self.trace.node("less", other, self)
 
+    def __bool__(self) -> bool:
+        raise TypeError("`if` on a component: use np.where, and np.minimum and np.maximum to clamp")
+
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
         """Record a NumPy function, or an operator whose left operand is a NumPy number."""
         if function in OPERATORS:
             left, right = given
             return OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
+        require_supported(function, _FUNCTIONS)
         return self.trace.node(_FUNCTIONS[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _keywords: Any) -> Number:
         """Record :func:`numpy.where`."""
-        assert function is np.where
+        require_supported(function, {np.where: "where"})
         return self.trace.node("where", *given)
 
 
 _FUNCTIONS = {getattr(np, name): name for name in ("sqrt", "minimum", "maximum", "exp", "log")}
+
+
+def require_supported(function: Any, supported: Mapping[Any, str]) -> None:
+    """Raise TypeError if a NumPy function of a component is not supported."""
+    if function not in supported:
+        names = ", ".join((*_FUNCTIONS.values(), "where"))
+        raise TypeError(f"np.{function.__name__} of a component: use + - * /, < and >, and NumPy's {names}")
+
 
 OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
     np.add: operator.add,

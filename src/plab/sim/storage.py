@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from plab.laws import Law
 from plab.laws.algebra import Series
 from plab.scenes import MANIPULATOR_SHAPES, Scene
+from plab.sim.codegen.bitcode import bitcode_file
 from plab.sim.compiler import ti
 from plab.sim.runtime import Runtime, own_fields
 from plab.sim.shapes import SURFACES, require_surfaces
@@ -133,6 +134,9 @@ class Storage:
         self.materials = first.material_count
         self.mixed = self.materials > 1
         self.laws: tuple[Law, ...] = tuple(dict.fromkeys(m.kind for m in first.materials[: self.materials]))
+        for law in self.laws:
+            # Written before the first kernel, because Taichi reports errors in kernels as its own.
+            bitcode_file(runtime.device, "f32" if self.real == ti.f32 else "f64", law, len(self.laws) > 1)
         self.coefficients = max(law.size for law in self.laws)
         self.series = Series.for_precision(runtime.precision)
         if singular_values:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plab import laws
+from plab.errors import ConfigError
 from plab.files import cache_dir
 from plab.laws import Law
 from plab.sim.compiler import QUADRANTS
@@ -56,6 +57,7 @@ def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = Fal
 
     Raises:
         plab.sim.DeviceError: If the file must be written and llvmlite cannot be loaded.
+        plab.config.ConfigError: If a law contains operations that are not supported.
     """
     code = None
     digest = hashlib.sha256(repr((_sources(), LAYOUTS.get(PLATFORM), device, precision, mixed)).encode())
@@ -116,7 +118,8 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
         import llvmlite.binding as llvm
         from llvmlite import ir
     except ImportError as error:
-        raise _unsupported(f"plab compiles its laws with llvmlite, which does not load: {error}") from None
+        message = f"plab compiles its laws with llvmlite, which does not load ({error}): install it again"
+        raise _unsupported(message) from None
     from plab.sim.codegen import materials, stencils
 
     if llvm.llvm_version_info[0] > 16 and not QUADRANTS:
@@ -136,8 +139,16 @@ def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
     module = ir.Module("plab")
     module.data_layout = LAYOUTS[PLATFORM] if device == "cpu" else ""
     module.triple = "" if device == "cpu" else "nvptx64-nvidia-cuda"
-    for name, make in makers.items():
-        make(module, symbol(unit, name, precision), ir.FloatType() if precision == "f32" else ir.DoubleType())
+    real = ir.FloatType() if precision == "f32" else ir.DoubleType()
+    try:
+        for name, make in makers.items():
+            make(module, symbol(unit, name, precision), real)
+    except Exception as error:
+        # A law of the user may raise anything.
+        if isinstance(unit, str):
+            raise
+        place = inspect.getsourcefile(unit.update)
+        raise ConfigError(f"law {unit.name} of {place} cannot be compiled: {error}") from error
     parsed = llvm.parse_assembly(str(module).replace('target triple = ""\n', ""))
     parsed.verify()
     return bytes(parsed.as_bitcode())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from plab.laws.tracing import OPERATORS
+from plab.laws.tracing import OPERATORS, require_supported
 from plab.sim.storage import LANES
 
 LANE = LANES["cpu"]
@@ -347,12 +347,14 @@ class Number:
 
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number | float) -> Any:
         """Apply NumPy's elementwise functions."""
-        own = OPERATORS.get(function)
-        return own(*given) if own else self._operation(_NAMES[function], *given)
+        if function in OPERATORS:
+            return OPERATORS[function](*given)
+        require_supported(function, _NAMES)
+        return self._operation(_NAMES[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Number:
-        """Implement :func:`numpy.where`; other NumPy functions of arrays are not supported."""
-        assert function is np.where
+        """Implement :func:`numpy.where`."""
+        require_supported(function, {np.where: "where"})
         return self._operation("chosen", *given)
 
 
