@@ -2,8 +2,8 @@
 
 In an environment step every joint moves by its share of the action, within its limits. Forward kinematics
 gives the frames of the links before and after; a link's twist is its displacement and the logarithm of its
-relative rotation, so that its final pose is exact. Sums are written out, so that results are bitwise
-independent of the number of environments.
+relative rotation, so that its final pose is exact. On the CPU, results are bitwise independent of the number
+of environments, because products of small matrices and sums over one dimension are computed in order.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ class JointActions:
         }
         self._arrays = {
             name: np.array([[getattr(joint, name) for joint in chain.joints] for chain in chains], float)
-            for name in ("offset", "axis", "anchor", "low", "high", "scale", "start", "hinge")
+            for name in ("low", "high", "scale", "start")
         }
         self.start = self._arrays["start"]
-        for name in ("offset", "axis", "anchor", "hinge"):
-            self._arrays[name] = self._arrays[name][:, order]
+        motions = np.array([[chain.joints[j].motion() for j in order] for chain in chains])
+        self._arrays["motions"] = motions.reshape(*motions.shape[:2], 4, 16)
         self._arrays["links"] = np.array([[link.offset for link in chain.links] for chain in chains])
         self._constants: dict[torch.device, dict[str, Tensor]] = {}
 
@@ -104,8 +104,7 @@ class JointActions:
             for move in moves:
                 at.append((at[-1] + move).clamp(c["low"], c["high"]))
             frames = self.frames(torch.stack(at))
-            turns = frames[..., :3, :3]
-            turned = rotation_vector(_product(turns[1:], turns[:-1].transpose(-1, -2)))
+            turned = rotation_vector(frames[1:, ..., :3, :3] @ frames[:-1, ..., :3, :3].mT)
             twists = torch.cat([frames[1:, ..., :3, 3] - frames[:-1, ..., :3, 3], turned], dim=-1)
             raw = torch.cat([given[..., : self._direct], twists.flatten(2)], dim=-1)
         return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
@@ -114,32 +113,22 @@ class JointActions:
         """Transforms from the links' frames to the world, shape [T, batch, link, 4, 4], given joint
         positions, shape [T, batch, joint]."""
         c = self._on(joints.device)
-        positions = joints.index_select(-1, c["order"])[..., None, None]
-        angle = positions * c["hinge"][..., None, None]
-        # Rodrigues' formula in homogeneous coordinates: rotations fix the anchor, slides move along the axis.
-        turn = angle.sin() * c["cross"] + (1.0 - angle.cos()) * c["cross2"]
-        moved = c["eye"] + _product(turn, c["to_anchor"]) + positions * c["slide"]
-        own = _product(c["offset"], moved).split(self._sizes, dim=2)
+        positions = joints.index_select(-1, c["order"])
+        factors = torch.stack(
+            [torch.ones_like(positions), positions.sin(), 1.0 - positions.cos(), positions], dim=-1
+        )
+        own = (factors.unsqueeze(-2) @ c["motions"]).reshape(*positions.shape, 4, 4).split(self._sizes, dim=2)
         world = [own[0]]
         for k, frames in enumerate(own[1:]):
-            world.append(_product(world[-1].index_select(2, c[f"parents{k}"]), frames))
+            world.append(world[-1].index_select(2, c[f"parents{k}"]) @ frames)
         still = c["eye"].expand(*joints.shape[:2], 1, 4, 4)
-        return _product(torch.cat([still, *world], dim=2).index_select(2, c["carriers"]), c["links"])
+        return torch.cat([still, *world], dim=2).index_select(2, c["carriers"]) @ c["links"]
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
         """Chain constants on a device."""
         if device not in self._constants:
             c = {name: torch.tensor(array, device=device) for name, array in self._arrays.items()}
-            x, y, z = c["axis"].unbind(-1)
-            o = torch.zeros_like(x)
-            rows = (o, -z, y, o), (z, o, -x, o), (-y, x, o, o), (o, o, o, o)
-            c["cross"] = torch.stack([torch.stack(row, -1) for row in rows], -2)
-            c["cross2"] = c["cross"] @ c["cross"]
-            c["eye"] = torch.eye(4, dtype=x.dtype, device=device)
-            c["to_anchor"] = c["eye"].repeat(*x.shape, 1, 1)
-            c["to_anchor"][..., :3, 3] = -c["anchor"]
-            c["slide"] = torch.zeros_like(c["cross"])
-            c["slide"][..., :3, 3] = c["axis"] * (1.0 - c["hinge"])[..., None]
+            c["eye"] = torch.eye(4, dtype=torch.float64, device=device)
             c |= {name: torch.tensor(index, device=device) for name, index in self._indices.items()}
             self._constants[device] = c
         return self._constants[device]
@@ -153,14 +142,8 @@ def rotation_vector(turn: Tensor) -> Tensor:
     cosine = 0.5 * (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1.0)
     small = (square < 1e-8) & (cosine > 0.0)
     sine = torch.where(small, 1.0, square).sqrt()
-    # angle / sin(angle), as a series in sin(angle)^2 near 0.
-    ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, torch.atan2(sine, cosine) / sine)
+    # angle / sin(angle), as a series in sin(angle)^2 near 0. Not by atan2, whose last bits depend on the
+    # number of elements.
+    angle = 2.0 * torch.atan(sine / (1.0 + cosine))
+    ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, angle / sine)
     return ratio[..., None] * axis
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix product, its sums in order."""
-    first, *others = (a.unsqueeze(-1) * b.unsqueeze(-3)).unbind(-2)
-    for term in others:
-        first = first + term
-    return first

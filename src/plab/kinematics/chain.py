@@ -70,18 +70,24 @@ class Joint:
     start: float = 0.0
     component: int = 0
 
+    def motion(self) -> np.ndarray:
+        """Matrices M, shape [4, 4, 4], of the transform from the joint frame to the parent's, at position q:
+        M[0] + sin(q) M[1] + (1 - cos(q)) M[2] + q M[3]."""
+        parts, (x, y, z) = np.zeros((4, 4, 4)), self.axis
+        parts[0] = np.eye(4)
+        if self.hinge:
+            # Rodrigues' formula about the anchor.
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            for part, turn in zip(parts[1:3], (cross, cross @ cross), strict=True):
+                part[:3] = np.column_stack([turn, -turn @ self.anchor])
+        else:
+            parts[3, :3, 3] = self.axis
+        return np.array(self.offset) @ parts
+
     def matrix(self, position: float) -> np.ndarray:
         """Transform from the joint frame to the parent's, shape [4, 4]."""
-        # Imported here and below, because it takes half a second and few scenes have a model.
-        from scipy.spatial.transform import Rotation
-
-        own, axis, anchor = np.eye(4), np.array(self.axis), np.array(self.anchor)
-        if self.hinge:
-            own[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
-            own[:3, 3] = anchor - own[:3, :3] @ anchor
-        else:
-            own[:3, 3] = position * axis
-        return np.array(self.offset) @ own
+        factors = (1.0, math.sin(position), 1.0 - math.cos(position), position)
+        return np.tensordot(factors, self.motion(), 1)
 
 
 @dataclass(frozen=True)
