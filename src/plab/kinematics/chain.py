@@ -6,16 +6,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import PlabError
-
-if TYPE_CHECKING:
-    from plab.kinematics.actions import JointActions
-    from plab.scenes import Scene
 
 __all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "ModelError", "matched", "pose_matrix"]
 
@@ -136,14 +132,6 @@ class Chain:
         return np.array(
             [(world[k.parent] if k.parent >= 0 else np.eye(4)) @ np.array(k.offset) for k in self.links]
         )
-
-    @staticmethod
-    def action_map(scenes: Sequence[Scene]) -> JointActions:
-        """Map from actions to twists, for a batch of scenes whose chains share one topology."""
-        # Imported here, because reading configurations does not need PyTorch.
-        from plab.kinematics.actions import JointActions
-
-        return JointActions(scenes)
 
     def largest_step(self) -> float:
         """Upper bound of the displacement of any point of a link in an environment step [domain units]."""

@@ -42,11 +42,6 @@ def load_mesh(file: str, sha256: str | None = None) -> Mesh:
     return _loaded(*pinned(file, sha256))
 
 
-@lru_cache(maxsize=16)
-def _loaded(file: str, sha256: str) -> Mesh:
-    return Mesh(file, sha256)
-
-
 def read_mesh(file: str, **options: Any) -> Any:
     """Read an OBJ, STL or PLY file with ``trimesh.load`` as a trimesh object with vertices; raise ShapeError
     if the file cannot be read or trimesh is not installed."""
@@ -190,3 +185,6 @@ class Mesh:
                 f"{file} encloses {share / expected:.2f} times the volume computed from its faces: unite "
                 "overlapping parts, and orient all faces outwards"
             )
+
+
+_loaded = lru_cache(maxsize=16)(Mesh)

@@ -35,7 +35,6 @@ __all__ = [
     "Manipulator",
     "ManipulatorShape",
     "Material",
-    "MeshBody",
     "Scene",
     "SceneError",
     "Vec3",
@@ -158,6 +157,7 @@ class Body:
 
     Attributes are those of :class:`plab.config.BodyConfig`: ``shape``, ``center`` and ``size`` [domain
     units], ``particles``, and material parameters; parameters that are None are inherited from the scene.
+    ``mesh`` is the mesh of a body of shape ``mesh``.
     """
 
     shape: str
@@ -169,6 +169,7 @@ class Body:
     yield_stress: float | None = field(default=None, kw_only=True)
     law: str | None = field(default=None, kw_only=True)
     parameters: Mapping[str, float] | tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
+    mesh: Mesh | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         """Convert the parameters to a hashable form."""
@@ -183,31 +184,16 @@ class Body:
 
     def half_extent(self) -> np.ndarray:
         """Half edges of the bounding box, shape [3]."""
+        if self.mesh is not None:
+            return self.size[0] / 2 * self.mesh.extent
         return np.full(3, self.size[0]) if self.shape == "sphere" else np.asarray(self.size, dtype=float) / 2
 
     @property
     def volume(self) -> float:
         """Volume at t = 0 [domain units^3]."""
+        if self.mesh is not None:
+            return math.prod(self.size * 3) * self.mesh.volume
         return 4 / 3 * math.pi * math.prod(self.size * 3) if self.shape == "sphere" else math.prod(self.size)
-
-
-@dataclass(frozen=True)
-class MeshBody(Body):
-    """A body with the shape of a mesh.
-
-    Attributes:
-        mesh: The mesh; ``center`` is the centre of its bounding box, ``size`` is ``(longest,)``, the longest
-            edge of that box.
-    """
-
-    mesh: Mesh
-
-    def half_extent(self) -> np.ndarray:
-        return self.size[0] / 2 * self.mesh.extent
-
-    @property
-    def volume(self) -> float:
-        return math.prod(self.size * 3) * self.mesh.volume
 
 
 def make_body(
@@ -221,8 +207,8 @@ def make_body(
 ) -> Body:
     """Create a body from a configuration, and read its mesh file, if any.
 
-    Arguments are fields of :class:`Body` or :class:`MeshBody`, and for a mesh its OBJ, STL or PLY file
-    and SHA-256, see :func:`plab.files.pinned`.
+    Arguments are fields of :class:`Body`, and for a mesh its OBJ, STL or PLY file and SHA-256, see
+    :func:`plab.files.pinned`.
 
     Raises:
         SceneError: If a mesh has no file, or another shape has one.
@@ -237,7 +223,7 @@ def make_body(
     # Imported here, because few scenes have meshes.
     from plab.scenes.mesh import load_mesh
 
-    return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256), **material)
+    return Body(shape, vector3(center), tuple(size), particles, mesh=load_mesh(file, sha256), **material)
 
 
 # ------------------------------------------------------------------------------------------- manipulators
@@ -514,7 +500,7 @@ class Scene:
         if self.kinematics is None:
             del facts["kinematics"]
         for body in facts["bodies"]:
-            for key in (*MATERIAL_KEYS, "law", "parameters"):
+            for key in (*MATERIAL_KEYS, "law", "parameters", "mesh"):
                 if body[key] in (None, (), ""):
                     del body[key]
         return facts
@@ -572,7 +558,7 @@ class Scene:
                 f"{label}: reaches {name} = {low:.3g} .. {high:.3g}, outside the domain 0 .. {top:.4g}: "
                 f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
             )
-        if isinstance(body, MeshBody):
+        if body.mesh is not None:
             thickness = body.size[0] * body.mesh.thickness
             least = 1.01 * body.size[0] * self.dx / thickness
             _require(
@@ -640,7 +626,7 @@ def sample_particles(scene: Scene) -> np.ndarray:
     rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)
     parts = []
     for body in scene.bodies:
-        if isinstance(body, MeshBody):
+        if body.mesh is not None:
             offset = body.size[0] * body.mesh.fill(body.particles, rng.random)
         elif body.shape == "box":
             offset = (rng.random((body.particles, 3)) - 0.5) * np.asarray(body.size)

@@ -60,13 +60,11 @@ class Runtime:
         device: ``cpu`` or ``cuda``.
         precision: ``float32`` or ``float64``, the type of particles and grid.
         threads: CPU threads; 1 on CUDA.
-        generation: Number of initialisations; simulators of older generations are invalid.
     """
 
     device: str
     precision: str
     threads: int
-    generation: int
 
     @property
     def real(self):
@@ -161,7 +159,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     clear_kernel_arguments()
     guard_array_release()
     defer_position_lookup()
-    _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
+    _current = Runtime(device, precision, wanted)
     return _current
 
 

@@ -43,7 +43,7 @@ from plab.sim.term_phases import LossTerm
 if TYPE_CHECKING:
     import torch
 
-    from plab.kinematics.actions import LinkMotion
+    from plab.kinematics.actions import JointActions, LinkMotion
 
 
 class Simulator:
@@ -685,11 +685,8 @@ class Simulator:
                 rollout with a gradient.
         """
         self._require_gradient()
-        bar = (
-            self._engine.world_bar.to_numpy()
-            .reshape(self.batch, -1, WORLD + self._engine.manipulators)
-            .sum(1)
-        )
+        bar = self._engine.world_bar.to_numpy()
+        bar = bar.reshape(self.batch, -1, WORLD + self.manipulator_count).sum(1)
         return {"floor_friction": bar[:, 0], "gravity": bar[:, 1:WORLD], "friction": bar[:, WORLD:]}
 
     def loss_gradient(self) -> State:
@@ -785,8 +782,12 @@ class Simulator:
 
     def _start_manipulators(self) -> None:
         self._initial_poses = initial_poses(self.scenes)
-        chain = self.scenes[0].kinematics
-        self._map = chain.action_map(self.scenes) if chain else None
+        self._map: JointActions | None = None
+        if self.scenes[0].kinematics:
+            # Imported here, because other scenes do not need PyTorch.
+            from plab.kinematics.actions import JointActions
+
+            self._map = JointActions(self.scenes)
         self._initial_joints = self._map.start if self._map else None
 
     def _checked_particles(self, x: ArrayLike, label: str = "particles") -> np.ndarray:

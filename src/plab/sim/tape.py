@@ -65,8 +65,8 @@ class Tape:
 
     def _place(self, t: int) -> tuple[ti.Ndarray, int]:
         """Array and slot of the history that hold the start of step t."""
-        number, masked_index = divmod(t % self._length, self._reach)
-        return self._history[number], masked_index * self._slots_per_step + (1 if self._engine.sorts else 0)
+        number, step = divmod(t % self._length, self._reach)
+        return self._history[number], step * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
         """Return the number of environment steps per segment for a gradient over T ``steps``: the largest
@@ -175,8 +175,8 @@ class Tape:
     def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
         """Run step t within the history; ``known`` is True if its particle order is known."""
         history, slot = self._place(t)
-        number, masked_index = divmod(t % self._length, self._reach)
-        if number and not masked_index:
+        number, step = divmod(t % self._length, self._reach)
+        if number and not step:
             end = self._reach * self._slots_per_step
             self._engine.copy_slot(self._history[number - 1], end, history, 0)
         if self._engine.sorts:
