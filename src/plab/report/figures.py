@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -99,8 +100,9 @@ def legend(figure: Figure, columns: int | None = None) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        # An entry takes about an inch.
-        columns = columns or min(len(entries), int(figure.get_figwidth() / 1.1))
+        # Widths in inches of a line with its margins, and of a letter.
+        width = sum(0.6 + 0.055 * len(label) for label in entries)
+        columns = columns or math.ceil(len(entries) / math.ceil(width / figure.get_figwidth()))
         figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns)
 
 
