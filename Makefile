@@ -124,4 +124,6 @@ $(VENV)/.docs.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(BIN)/python:
+	@$(PYTHON) -c "import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))" || { \
+		echo "plab needs Python 3.10 to 3.14, not $$($(PYTHON) --version 2>&1): add PYTHON=python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)

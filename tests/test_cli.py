@@ -30,9 +30,6 @@ def test_cuda_without_a_device(refused):
     assert "sim.device" in refused(["sim.device=cuda"])
 
 
-# ----------------------------------------------------------------------------------------------- help, --cfg
-
-
 def test_help_names_all_choices(capsys):
     assert main(["--help"]) == 0
     text, _ = capsys.readouterr()
@@ -57,9 +54,6 @@ def test_cfg_job_prints_the_configuration(capsys, tmp_path):
     out, err = capsys.readouterr()
     assert "seed: 3\n" in out and "precision: float32\n" in out and err == ""
     assert list(tmp_path.iterdir()) == []
-
-
-# ------------------------------------------------------------------------------ runs, sweeps
 
 
 def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_path):
@@ -123,6 +117,16 @@ def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code, nam
 def test_sigterm_ends_a_run_as_ctrl_c_does(monkeypatch, capsys):
     monkeypatch.setattr("plab.runners.run_config", lambda cfg: signal.raise_signal(signal.SIGTERM))
     assert main([]) == 130 and "run the same command again" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_a_command_starts(tmp_path):
+    kill = "os.kill(os.getpid(), signal.SIGINT)"
+    code = "from plab.cli.command import *\nwith prompt_interrupts():\n try: {}\n except BaseException: pass"
+    done = subprocess.run([sys.executable, "-c", code.format(kill)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "plab: stopped\n")
+    (tmp_path / "gymnasium.py").write_text(f"import os, signal, time; {kill}; time.sleep(9)")
+    done = subprocess.run([sys.executable, "-m", "plab"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
 def test_a_real_run_and_the_same_command_again(tmp_path, capsys):

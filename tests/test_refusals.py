@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -235,15 +234,11 @@ def test_rollouts_of_no_steps_and_of_no_numbers():
             simulator.rollout(given, gradient=False)
 
 
-NO_RAY = pytest.mark.skipif(find_spec("ray") is not None, reason="the extra ray is installed")
 EXTRAS = [
     ("pyvista", "render", render, "task=Rope"),
     ("PIL", "render", render, "task=Rope --output a.gif"),
     ("tensorboard", "tensorboard", main, "task=Move method=adam logger=tensorboard"),
     ("wandb", "wandb", main, "-m task=Move method=sac logger=wandb"),
-    pytest.param(
-        "hydra_plugins.hydra_ray_launcher", "ray", main, "-m hydra/launcher=ray seed=0,1", marks=NO_RAY
-    ),
 ]
 
 

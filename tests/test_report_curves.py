@@ -26,8 +26,6 @@ from plab.report.statistics import (
 )
 from plab.report.tables import score_at_budget
 
-# ------------------------------------------------------------------------------------------------------ bands
-
 
 def test_band_is_mean_and_spread_where_all_runs_are() -> None:
     one = pd.DataFrame({"episodes": [1, 3, 5], "reward": [0.0, 2.0, 4.0]})
@@ -55,9 +53,6 @@ def test_values_below_zero_count_as_zero_run_by_run() -> None:
     later = runs[0].assign(episodes=[8, 9])
     assert band([], "episodes", "reward") is None
     assert band([runs[0], later], "episodes", "reward") is None
-
-
-# ---------------------------------------------------------------------------------------------------- budgets
 
 
 def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
@@ -109,9 +104,6 @@ def test_table_of_scores_at_equal_budgets(tmp_path: Path) -> None:
     assert data["seconds"][1e6] == pytest.approx(4.0, abs=0.4)
 
 
-# ------------------------------------------------------------------------------------------------- aggregates
-
-
 def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
     strata = [np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.4, 0.5, 0.6, 9.0])]
     found = interquartile_mean(strata)
@@ -142,9 +134,6 @@ def test_methods_are_compared_on_what_they_share() -> None:
     assert keys == [("Rope", "2")] and strata["adam"][0].tolist() == [0.0] * 3
     keys, strata = common_strata(scores | {"sac": {("Move", "1"): np.ones(1)}})
     assert keys == [("Rope", "2")] and set(strata) == {"adam", "gd"}
-
-
-# ---------------------------------------------------------------------------------------------------- figures
 
 
 @pytest.fixture(scope="module")

@@ -90,9 +90,6 @@ def bold_cells(table: Table) -> pd.DataFrame:
     return pd.DataFrame(table.bold, index=table.cells["task"], columns=table.cells.columns)
 
 
-# ------------------------------------------------------------------------------------------------- IoU tables
-
-
 def test_cells_per_task(folder: Path) -> None:
     runs = gather(folder)
     assert len(runs.table) == 3 * 15 - 1 + 2
@@ -148,9 +145,6 @@ def test_differences_and_rows_per_configuration(folder: Path) -> None:
     assert single == "0.40 (1/3)"
 
 
-# ------------------------------------------------------------------------------------------------- statistics
-
-
 def test_difference_has_welchs_interval_in_a_single_stratum() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.normal(0.5, 0.1, 7), rng.normal(0.2, 0.3, 4)
@@ -172,9 +166,6 @@ def test_strata_take_the_variance_between_variants_out() -> None:
     assert found.value == pytest.approx(-0.05) and np.isnan(found.low)
     nothing = stratified_difference([summarise([])], [Summary(0.4, 0.1, 3)])
     assert np.isnan(nothing.value)
-
-
-# --------------------------------------------------------------------------------------------------- settings
 
 
 def test_mixed_settings_are_refused_with_advice(tmp_path: Path) -> None:
@@ -238,9 +229,6 @@ def test_protocols_are_not_mixed(tmp_path: Path) -> None:
     assert "protocol.floor = plab" in gather(tmp_path / "other").unusual
 
 
-# ----------------------------------------------------------------------------------------------- side by side
-
-
 def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> None:
     for rate, score in ((0.1, 0.4), (0.01, 0.8)):
         for seed in range(3):
@@ -261,9 +249,6 @@ def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> N
     assert "sim.grid_size" in told(words, main)
     runs = gather(tmp_path, "task=Rope", "variant=1", "method.lr=0.1", split="seed")
     assert [name for name in runs.methods if "seed" in name][:2] == ["adam seed=0", "adam seed=1"]
-
-
-# ----------------------------------------------------------------------------------------------- other tables
 
 
 def test_times_are_per_environment_step(tmp_path: Path) -> None:
@@ -308,9 +293,6 @@ def test_hyperparameters_are_read_from_the_files() -> None:
     assert bold.loc[("SAC", "tau")].any() and not bold.loc[("SAC", "gamma")].any()
 
 
-# ------------------------------------------------------------------------------------------- shipped archives
-
-
 AGREEMENT = {
     "release": {
         "all gradient": ("150", "0.97", "97 %"),
@@ -342,9 +324,6 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
         cells = table.cells.set_index("method")
         assert tuple(cells.loc[label, ["cells", "correlation", "agree"]]) == row
         assert " of ".join(row[:1] * 2) + f" | {row[1]} | {row[2]} |" in page
-
-
-# ------------------------------------------------------------------------------------------------------ files
 
 
 @pytest.fixture(scope="module")

@@ -119,6 +119,8 @@ def test_command_line(folder: Path, tmp_path: Path, told, capsys) -> None:
     assert "1 run(s)" in capsys.readouterr().out
     assert main(["unpack", archive, "--output", str(tmp_path / "out")]) == 0
     assert main(["check", str(tmp_path / "out"), archive]) == 0
+    (tmp_path / "README.md").write_text("text")
+    assert main(["check", str(tmp_path / "README.md")]) == 1 and "delete" not in capsys.readouterr().out
     for word, named in (("task=Nothing", "Nothing"), ("tusk=Rope", "tusk")):
         assert named in told(["pack", str(folder), word, "--output", archive], main)
 
@@ -134,9 +136,8 @@ def test_iterations_can_be_rounded(folder: Path, tmp_path: Path) -> None:
         pd.testing.assert_frame_equal(one.iterations, other.iterations, rtol=0.5e-2)
         assert other.best_loss == other.iterations["loss"].min()
     assert main(["check", str(archive)]) == 0
-
-
-# ---------------------------------------------------------------------------------------------------- checks
+    assert main(["pack", str(folder), "--digits", "400", "--output", str(tmp_path / "b.plab.zip.xz")]) == 0
+    assert (tmp_path / "b.plab.zip.xz").stat().st_size > archive.stat().st_size
 
 
 def problem(path: Path) -> str:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import threading
 from argparse import Namespace
 from contextlib import closing
 from pathlib import Path
@@ -56,9 +60,6 @@ def ask(source: Path | list[Path], sql: str) -> list[tuple]:
         return connection.execute(sql).fetchall()
 
 
-# --------------------------------------------------------------------------------------------- same as files
-
-
 def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list[str]) -> None:
     archive = folder.parent / "all.plab.zip.xz"
     pack(folder, archive)
@@ -92,9 +93,6 @@ def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
     assert [row.config for row in kept] == [read(row.path).config for row in kept]
     assert ask(tmp_path, "SELECT DISTINCT value FROM config WHERE key = 'seed_scene'") == [(str(2**70),)]
     assert ask(tmp_path, "SELECT DISTINCT number FROM config WHERE key = 'task.limit'") == [(float("inf"),)]
-
-
-# ------------------------------------------------------------------------------------------------- staleness
 
 
 def test_changed_new_and_removed_files_are_noticed(folder: Path, opened: list[str]) -> None:
@@ -152,9 +150,6 @@ def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:
         path.write_bytes(path.read_bytes()[:5000] + b"x" * 99)
     pd.testing.assert_frame_equal(load(folder), expected)
     assert ask(folder, "SELECT count(*) FROM runs") == [(3,)] and not recwarn.list
-
-
-# ------------------------------------------------------------------------------------------------------- SQL
 
 
 def test_tables(folder: Path) -> None:
@@ -219,9 +214,12 @@ def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
     assert main(["sql", sql, str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"task": "Rope", "n": 3, "mean": 1.0, "nil": None}]
     assert str(folder / "no") in told(["sql", "select 1", str(folder / "no")], main)
-
-
-# -------------------------------------------------------------------------------------- scores and pictures
+    odd = f"{sys.executable} -m plab results sql 'select chr(27) || chr(177) a' {folder}"
+    ascii = os.environ | {"PYTHONIOENCODING": "ascii"}
+    assert subprocess.run(odd, shell=True, env=ascii, stdout=subprocess.PIPE).stdout == b"a\n\\xb1\n"
+    assert subprocess.run(f"{odd} >&-", shell=True).returncode == 0
+    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert main(["sql", "select count(*) from range(100000000000) a, range(100000000)", str(folder)]) == 130
 
 
 def test_scores(folder: Path, told, capsys) -> None:

@@ -97,9 +97,6 @@ def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
     return str(caught.value)
 
 
-# -------------------------------------------------------------------------------------------------- files
-
-
 def test_round_trip_of_plans(path: Path) -> None:
     found = read(path)
     assert found.card == CARD and found.plab == plab.__version__ and found.track == "plans"
@@ -203,9 +200,6 @@ def test_the_budget_of_a_card_bounds_the_steps(tmp_path: Path) -> None:
     assert "budget of 5,499" in line and "5,500" in line
 
 
-# -------------------------------------------------------------------------------------------------- cards
-
-
 def test_cards_that_are_read() -> None:
     assert parse_card(yaml.safe_dump(GOOD).encode(), "card.yaml") == CARD
     del (short := dict(GOOD))["description"]
@@ -215,7 +209,23 @@ def test_cards_that_are_read() -> None:
     assert example in (ROOT / "docs" / "submissions.md").read_text(encoding="utf-8")
 
 
-# ----------------------------------------------------------------------------------------- configurations
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        # Nested merge keys, which expand to 9^11 values.
+        (
+            "a0: &a0 {x: 1}\n"
+            + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{f'*a{i}, ' * 9}]\n" for i in range(11)),
+            "alias",
+        ),
+        ("budget: 0x" + "f" * 7000, "budget"),
+        ('name: "\\e[31mred"', "control"),
+        ('authors: ["\\ud800"]', "control"),
+        ("name: " + "[" * 3000, "recursion"),
+    ],
+)
+def test_cards_that_are_refused(line: str, fault: str) -> None:
+    assert fault in why(parse_card, f"{yaml.safe_dump(GOOD)}{line}".encode(), "card.yaml")
 
 
 def test_configurations_have_their_names_and_compose_themselves() -> None:
@@ -232,9 +242,6 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
     assert "Move-vrandom3" in why(configuration_of, drawn)
     for word in ("protocol.floor=release", "targets.source=there"):
         assert "protocol=plab" in why(configuration_of, load_config(["task=Move", word]))
-
-
-# ------------------------------------------------------------------------------------------ command lines
 
 
 @pytest.fixture
@@ -275,9 +282,6 @@ def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Ca
     with_manifest(path, {"physics": 99, "plab": "9.0"})
     line = told([str(path)], verify)
     assert "physics version 99" in line and "9.0" in line
-
-
-# ----------------------------------------------------------------------------------------------- the page
 
 
 def real(variant: str, steps: int, score: float, **which: Any) -> Entry:
@@ -361,6 +365,12 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
     assert line["status"] == "claimed"
     (tmp_path / "plans.verified.json").write_text("{}")
     assert "plans.verified.json" in why(read_verification, read(path))
+    for values in ({"score": [1]}, {"score": np.nan}, {"score": 10**400}, {"outcome": "true"}):
+        judged(path, [0.5] * 3)
+        record = json.loads((tmp_path / "plans.verified.json").read_text())
+        record["entries"][0] |= values
+        (tmp_path / "plans.verified.json").write_text(json.dumps(record))
+        assert "Move-v1 after" in why(read_verification, read(path))
 
 
 def test_the_papers_numbers_are_a_table(leaders) -> None:

@@ -74,9 +74,6 @@ def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
     return str(caught.value)
 
 
-# ----------------------------------------------------------------------------------------------- recorder
-
-
 def test_the_best_episode_of_each_budget_is_kept(
     tmp_path: Path, env: gymnasium.Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,9 +130,6 @@ def test_what_cannot_be_recorded(tmp_path: Path, env: gymnasium.Env, monkeypatch
     assert str(tmp_path / NAME) in why(record, env, tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------- verifying
-
-
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory, env: gymnasium.Env) -> Path:
     """A submission with two configurations, recorded and packed."""
@@ -177,9 +171,6 @@ def test_claims_are_simulated_again(
     assert [v.outcome for v in kept] == [HOLDS, HOLDS, HOLDS, LIES, BROKE_OFF]
     # On the CPU the same to the bit.
     assert [v.score for v in kept[:4]] == [one.score for one in (first, second, second, second)]
-
-
-# ----------------------------------------------------------------------------------------------- policies
 
 
 class Acting(torch.nn.Module):

@@ -83,8 +83,7 @@ def test_missing_gpus_and_packages_are_named(refused, monkeypatch) -> None:
 @pytest.mark.skipif(not Path("/proc/locks").exists(), reason="finds the processes of runs in /proc/locks")
 @pytest.mark.parametrize(
     ("launcher", "package"),
-    # Ray cannot be installed next to today's joblib.
-    [("joblib", "joblib"), ("submitit_local", "submitit"), ("ray", "ray"), ("gpus", "torch")],
+    [("joblib", "joblib"), ("submitit_local", "submitit"), ("gpus", "torch")],
 )
 def test_a_sweep_with_a_killed_job_is_completed_by_the_same_command(tmp_path, launcher, package) -> None:
     pytest.importorskip(package)

@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
 import tempfile
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if (_words := [os.path.basename(word) for word in sys.orig_argv[1:3]])[:1] == ["plab"] or (
+    _words[:1] == ["-m"] and _words[-1].partition(".")[0] == "plab"
+):
+    # Ctrl-C ends a command without a traceback until plab.cli.command handles it.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # Set before Taichi is imported: otherwise it prints a banner on standard output, and sends version, platform
 # and an id to its developers.

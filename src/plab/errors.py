@@ -51,10 +51,15 @@ def suggest(name: str, names: Sequence[str]) -> str:
     return f"{guess}choose from: {', '.join(names)}"
 
 
+def printable(text: str) -> str:
+    """Return text as one line without control characters, which a terminal would execute."""
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+
+
 def print_error(message: str) -> None:
     """Print a line on standard error, for all errors and warnings."""
     with suppress(BrokenPipeError):
-        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+        print(f"plab: {printable(message)}", file=sys.stderr)
 
 
 def out_of_memory(error: MemoryError) -> str:

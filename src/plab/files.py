@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from plab.errors import PlabError
+from plab.errors import PlabError, printable
 
 LARGEST = 1 << 31
 """Largest size of an array, a table or an archive member in memory [bytes]."""
@@ -63,8 +63,7 @@ def cache_dir() -> Path:
 
 def one_line(error: BaseException) -> str:
     """Return an error's message as one line of bounded length, without control characters."""
-    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
-    return " ".join(text.split())[:300] or type(error).__name__
+    return printable(str(error))[:300] or type(error).__name__
 
 
 def regular_file(path: Path) -> os.stat_result:

@@ -6,6 +6,7 @@ import csv
 import functools
 import gc
 import inspect
+import io
 import json
 import math
 import os
@@ -15,8 +16,8 @@ import sys
 import threading
 import traceback
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -28,6 +29,7 @@ from plab.errors import (
     PlabError,
     out_of_memory,
     print_error,
+    printable,
     suggest,
     traceback_wanted,
 )
@@ -58,6 +60,9 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         if threading.current_thread() is threading.main_thread():
             # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
             signal.signal(signal.SIGTERM, signal.default_int_handler)
+            if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+        _open_output()
         try:
             code = main(list(sys.argv[1:] if argv is None else argv)) or 0
             # Not left to interpreter shutdown, which would print its own messages.
@@ -89,6 +94,37 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         return PlabError.exit_code
 
     return answered
+
+
+@contextmanager
+def prompt_interrupts() -> Iterator[None]:
+    """End the process on Ctrl-C and SIGTERM inside the ``with`` block, for imports before a run begins.
+
+    A library may catch KeyboardInterrupt while it is imported, which would lose the interrupt.
+    """
+
+    def leave(*_: Any) -> NoReturn:
+        print_error("stopped")
+        os._exit(EXIT_INTERRUPTED)
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    main = threading.current_thread() is threading.main_thread()
+    former = [(one, signal.signal(one, leave)) for one in signals if main]
+    try:
+        yield
+    finally:
+        for one, handler in former:
+            signal.signal(one, handler)
+
+
+def _open_output() -> None:
+    """Discard output to a closed stream, and escape characters that a stream cannot encode."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _close_output() -> int:
@@ -293,7 +329,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str
         rows: A value for each column.
         form: ``text``, with right-aligned numeric columns, ``csv``, or ``json``, a list of objects.
     """
-    cells = [[None if value is None or value != value else value for value in row] for row in rows]
+    cells = [[_cell(value) for value in row] for row in rows]
     if form == "json":
         # JSON has no infinite numbers.
         shown = [[str(value) if value in (math.inf, -math.inf) else value for value in row] for row in cells]
@@ -311,7 +347,13 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str
             print("  ".join(line).rstrip())
 
 
-def _text(value: Any) -> str:
+def _cell(value: Any) -> Any:
     if value is None or value != value:
+        return None
+    return printable(value) if isinstance(value, str) else value
+
+
+def _text(value: Any) -> str:
+    if value is None:
         return ""
-    return f"{value:.6g}" if isinstance(value, float) else " ".join(str(value).split())
+    return f"{value:.6g}" if isinstance(value, float) else printable(str(value))

@@ -25,7 +25,7 @@ from plab.cli.command import (
     sources_and_words,
 )
 from plab.config.selection import require_possible, select
-from plab.errors import print_error
+from plab.errors import print_error, printable
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.run_file import ResultsError
@@ -85,14 +85,15 @@ def _check(argv: Sequence[str]) -> int:
     parser = Parser("plab results check", _check.__doc__)
     add_sources(parser)
     options = parser.parse_intermixed_args(argv)
-    count = wrong = 0
+    count = wrong = runs = 0
     for source in sources_and_words(options.sources)[0]:
         for path, fault in check(source):
             count += 1
             if fault:
                 wrong += 1
-                print(f"{path}: {fault}", flush=True)
-    advice = "; delete these files and run them again, or run them with force=true" if wrong else ""
+                runs += path.suffix == ".h5" and path.is_file()
+                print(printable(f"{path}: {fault}"), flush=True)
+    advice = "; delete the faulty .h5 files and run them again, or run them with force=true" if runs else ""
     print(f"{count} run(s) checked, {wrong} faulty{advice}")
     return 1 if wrong else 0
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
-from plab.cli.command import Parser, command_line
+from plab.cli.command import Parser, command_line, prompt_interrupts
 from plab.config import EXPERIMENT, GROUPS, ConfigError, choices, conf_folder, load_config
 from plab.config.compose import check_overrides, check_sources, compose_with_hydra, require_runnable
 from plab.config.overrides import parse, prepared
@@ -38,13 +38,15 @@ def main(argv: Sequence[str]) -> int:
     try:
         if (master := _sweep_settings(options, words)) is not None:
             # Imported here and below, because torch and Taichi take seconds to load.
-            from plab.sweep.execution import sweep
+            with prompt_interrupts():
+                from plab.sweep.execution import sweep
 
             return sweep(words, master, config_dir)
         cfg = load_config(words, config_dir, alone=True)
         check_sources(cfg)
         require_runnable(cfg)
-        from plab.runners import run_config
+        with prompt_interrupts():
+            from plab.runners import run_config
 
         run_config(cfg)
     except KeyboardInterrupt:

@@ -113,7 +113,7 @@ COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
 
 def explain(error: Exception) -> str:
     """Return a one-line message, without a full stop, for one of :data:`COMPOSE_ERRORS`."""
-    if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|ray|submitit)", str(error)):
+    if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|submitit)", str(error)):
         return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")

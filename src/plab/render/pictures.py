@@ -127,18 +127,17 @@ def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: 
 def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     import imageio_ffmpeg
 
-    writer = imageio_ffmpeg.write_frames(
-        str(path), renderer.size, fps=STEPS_PER_SECOND / every, codec="libx264", quality=8, macro_block_size=2
-    )
-    with closing(writer):
-        writer.send(None)
-        for frame in _frames(recording, renderer, every):
-            writer.send(np.ascontiguousarray(frame))
-        for _ in range(round(_HOLD * STEPS_PER_SECOND / every) - 1):
-            writer.send(np.ascontiguousarray(frame))
+    options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    writer = imageio_ffmpeg.write_frames(str(path), renderer.size, fps=STEPS_PER_SECOND / every, **options)
     try:
+        with closing(writer):
+            writer.send(None)
+            for frame in _frames(recording, renderer, every):
+                writer.send(np.ascontiguousarray(frame))
+            for _ in range(round(_HOLD * STEPS_PER_SECOND / every) - 1):
+                writer.send(np.ascontiguousarray(frame))
         imageio_ffmpeg.count_frames_and_secs(str(path))
-    except RuntimeError:
+    except (OSError, RuntimeError):
         # ffmpeg may write only part of the film without reporting an error.
         raise OSError("the film is incomplete; the disk may be full") from None
 

@@ -203,13 +203,13 @@ def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> Non
 
     Args:
         path: The file.
-        content: Content; text is encoded as UTF-8.
+        content: Content; text is encoded as UTF-8, with backslashes for file names that are not.
         sync: Whether to flush the file to disk.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then unchanged.
     """
-    content = content.encode() if isinstance(content, str) else content
+    content = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

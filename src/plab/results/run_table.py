@@ -409,6 +409,11 @@ def query(
         # Omit hints and the marked position in the query.
         first = " ".join(str(error).partition("\n")[0].split())
         raise ArgumentError(f"{first}; the tables are {', '.join(_TABLES)}") from None
+    except RuntimeError as error:
+        # DuckDB receives Ctrl-C itself.
+        if "interrupted" in str(error).lower():
+            raise KeyboardInterrupt from None
+        raise
 
 
 def scores(

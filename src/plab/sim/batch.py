@@ -35,14 +35,15 @@ def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
     """Raise SceneError if scenes (and ``like``) cannot be simulated or cannot share a simulator."""
-    if isinstance(scenes, Scene):
+    if not isinstance(scenes, Sequence):
         raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
     if not scenes:
         raise SceneError("a simulator needs at least one scene")
     first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
     for number, scene in enumerate(scenes):
         if not isinstance(scene, Scene):
-            raise SceneError(f"scenes must be results of build_scene(), not {scene!r}")
+            kind = type(scene).__name__
+            raise SceneError(f"scenes must be of type Scene, not {kind}: plab.make_simulator takes a Config")
         scene.validate()
         for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
             if own != other:

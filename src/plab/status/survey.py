@@ -13,6 +13,7 @@ import pandas as pd
 
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
+from plab.errors import printable
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
 from plab.results.run_table import rows
@@ -146,7 +147,8 @@ def _described(row: Row, state: str) -> dict[str, Any]:
     values, method = row.values, row.config["method"]
     total = row_count(method) or method.get("episodes") or 0
     known = {name: values[name] for name in ("score", "seconds", "path")}
-    known |= {"state": state, "message": values["message"] if state == "failed" else "", "total": total}
+    message = printable(values["message"]) if state == "failed" else ""
+    known |= {"state": state, "message": message, "total": total}
     known["done"] = total if state == "done" else int(values["iterations"])
     return known | (_measured(row.path, total) if state == "running" else {})
 

@@ -44,6 +44,9 @@ VARIANTS = (*SUITE_VARIANTS, *UNSEEN)
 _CARD_BYTES, _TOTAL_BYTES = 8_000, 500_000_000
 """Maximum size of a card, and of all members of a file together."""
 
+_STEPS = 10**15
+"""Exclusive limit of numbers of environment steps."""
+
 _CARD, _MANIFEST = "card.yaml", "manifest.json"
 
 
@@ -190,6 +193,14 @@ def _require(fits: bool, fault: str) -> None:
         raise UnreadableError(fault)
 
 
+class _CardLoader(yaml.SafeLoader):
+    """Loader without aliases, because a few nested ones expand to billions of values."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        _require(not self.check_event(yaml.AliasEvent), "it contains an alias (*name): write the value out")
+        return super().compose_node(parent, index)
+
+
 def parse_card(text: bytes, source: str) -> Card:
     """Parse a card, YAML in UTF-8; messages name its ``source``.
 
@@ -198,15 +209,18 @@ def parse_card(text: bytes, source: str) -> Card:
     """
     try:
         _require(len(text) <= _CARD_BYTES, f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
-        record = yaml.safe_load(text.decode("utf-8"))
+        record = yaml.load(text.decode("utf-8"), _CardLoader)
         _require(isinstance(record, dict), f"a card has the keys {', '.join(_CARD_KINDS)}")
         record = {"description": ""} | record
         if odd := record.keys() ^ _CARD_KINDS.keys():
             raise UnreadableError(f"the key {min(odd, key=str)!r:.60} is missing or unknown")
         for key, kind in _CARD_KINDS.items():
             _require(type(record[key]) is kind, f"{key} must be of type {kind.__name__}")
+        _require(0 <= record["budget"] < _STEPS, f"budget must be from 0 to {_STEPS - 1}")
         authors = record["authors"]
         _require(bool(authors) and all(type(name) is str for name in authors), "authors must be names")
+        shown = [*authors, *(record[key] for key, kind in _CARD_KINDS.items() if kind is str)]
+        _require("".join("".join(shown).split()).isprintable(), "it contains control characters")
         # The page links to it.
         link = re.fullmatch(r"https?://\S+", record["link"])
         _require(link is not None, "link must be an address that begins with https:// or http://")
@@ -292,7 +306,7 @@ def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
     known = configuration.task in suite_tasks() and configuration.variant in VARIANTS
     _require(known, f"{where}: the leaderboard has no {configuration}")
     steps, score, file = record["steps"], record["score"], record["file"]
-    _require(type(steps) is int and 0 <= steps < 10**15, f"{where}: steps is {steps!r:.60}")
+    _require(type(steps) is int and 0 <= steps < _STEPS, f"{where}: steps is {steps!r:.60}")
     _require(type(score) in (int, float) and 0.0 <= score <= 1.0, f"{where}: score is {score!r:.60}")
     kind = re.fullmatch(r"(actions|policies)/[\w.-]+\.(npy|pt|onnx)", file)
     _require(kind is not None and file in members, f"{where}: there is no file {file!r:.60}")

@@ -24,6 +24,7 @@ from plab.config import Config
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
 from plab.errors import print_error
+from plab.files import UnreadableError
 from plab.render import RenderError, rollouts
 from plab.report.statistics import BUDGETS, load_rows
 from plab.results import ResultsError, Row
@@ -48,7 +49,7 @@ TOLERANCE = 0.02
 """Tolerance between claimed and simulated scores. The CPU is bitwise reproducible; on CUDA the last digits
 vary, amplified by contact."""
 
-HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
+HOLDS, LIES, BROKE_OFF, NOT_RUN = _OUTCOMES = ("holds", "does not hold", "broke off", "not run")
 
 _BATCH = 25
 """Maximum number of configurations in one simulator."""
@@ -288,7 +289,12 @@ def read_verification(submission: Submission) -> list[Verdict]:
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
             return []
         pairs = zip(submission.entries, record["entries"], strict=True)
-        return [Verdict(entry, own["score"], own["outcome"], own["why"]) for entry, own in pairs]
+        verdicts = [Verdict(entry, own["score"], own["outcome"], str(own["why"])) for entry, own in pairs]
+        for one in verdicts:
+            scored = type(one.score) is float and (0.0 <= one.score <= 1.0 or math.isnan(one.score))
+            if not scored or one.outcome not in _OUTCOMES or (one.outcome == HOLDS and math.isnan(one.score)):
+                raise UnreadableError(f"{one.entry.name}: {one.outcome!r:.60}, score {one.score!r:.60}")
+        return verdicts
 
 
 # ------------------------------------------------------------------------------------------------ recordings
