@@ -162,8 +162,17 @@ def test_blocks_carry_the_stress_of_closed_forms(size: float) -> None:
             np.testing.assert_allclose(-moment / DT, wanted, rtol=0, atol=1e-8 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize(("case", "cells", "tolerance"), [("swirl", 8, 0.03), ("layer", 8, 0.03)])
-def test_fluids_have_their_viscosity_and_their_weight(case: str, cells: int, tolerance: float) -> None:
+@pytest.mark.parametrize(
+    ("case", "cells", "tolerance"),
+    [
+        ("swirl", 8, 0.03),
+        ("layer", 8, 0.03),
+        pytest.param("collapse", 8, 0.4, marks=pytest.mark.nightly),
+        pytest.param("dam", 6, 0.5, marks=pytest.mark.nightly),
+    ],
+)
+def test_fluids_and_sand_move_as_in_theory_and_experiments(case: str, cells: int, tolerance: float) -> None:
+    """Viscosity, weight, a sand column's run-out and height, the front behind a broken dam."""
     for what, value, wanted in laws.CASES[case][0](cells):
         assert value == pytest.approx(wanted, abs=tolerance), what
 
