@@ -32,8 +32,9 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-# A file of tests stays in one process, which compiles its kernels once. A test that hangs is ended after 15 minutes.
-PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
+# A file of tests stays in one process, which compiles its kernels once; files start in the order of tests/conftest.py.
+# A test that hangs is ended after 15 minutes.
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
 .PHONY: run dev test test-all test-gpu lint typecheck coverage benchmark docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,11 @@ OF_ANY_DEVICE = (
 )
 """Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
+FIRST = """manipulators losses simulator protocol kernel_pairs kinematics mixed_laws mixed_materials laws
+trajectory autograd free_bodies runtime rl tutorials planners wrappers envs""".split()
+"""Files that start first: those in float64 or with more threads, which invalidate the simulators of all other
+tests, then the longest."""
+
 
 @pytest.fixture(scope="session")
 def device() -> str:
@@ -38,11 +44,15 @@ def device() -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def _shared_simulators() -> Iterator[None]:
-    """Let environments and runs of the same kind share simulators."""
+    """Let environments and runs of the same kind share simulators, and keep the garbage collection that finds
+    free ones quick by exempting all that has been imported."""
+    gc.collect()
+    gc.freeze()
     with pytest.MonkeyPatch.context() as patch:
         for name in ("problem", "envs.core", "render.rollouts", "bench.workload"):
             patch.setattr(f"plab.{name}.make_simulator", shared_simulator)
         yield
+    gc.unfreeze()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -137,6 +147,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if DEVICE == "cuda" and item.nodeid.startswith(OF_ANY_DEVICE):
             item.add_marker("gpu")
+    order = {f"test_{name}": number for number, name in enumerate(FIRST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_devices():
         for item in needing:

@@ -6,6 +6,7 @@ import gc
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -70,14 +71,17 @@ def stopped_at(call: int, where: Any = RunFile, name: str = "record") -> Iterato
 
 
 SIMULATORS: list[tuple[Any, Simulator]] = []
-"""The last simulators, by kind; compiling one takes longer than most tests."""
+"""The last simulators, by kind, the last used one last; compiling one takes longer than most tests."""
 
 
 def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options: Any) -> Simulator:
     """Return a simulator as :func:`plab.problem.make_simulator` does, reusing one that nobody refers to."""
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
     scenes = build_scenes(cfgs) if scenes is None else scenes
-    key = len(cfgs), simulator_key(cfgs[0], scenes[0]), repr({k: v for k, v in options.items() if v})
+    alike = replace(cfgs[0], sim=replace(cfgs[0].sim, memory_mb=0.0))
+    given = {name: value for name, value in options.items() if value}
+    terms = [(type(term), term.name, term.weight) for term in given.pop("terms", ())]
+    key = len(cfgs), simulator_key(alike, scenes[0]), repr((terms, given))
     same = [simulator for known, simulator in SIMULATORS if known == key]
     for collect in (bool, gc.collect) if same else ():
         collect()
@@ -86,6 +90,10 @@ def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options
             if sys.getrefcount(simulator) == 4:
                 with suppress(RuntimeError):  # Taichi has been restarted.
                     simulator.set_scenes(scenes)
+                    simulator.memory_mb = cfgs[0].sim.memory_mb
+                    simulator.set_contact("soft")
+                    simulator.set_weights({term.name: term.weight for term in simulator.terms})
+                    SIMULATORS.sort(key=lambda entry: entry[1] is simulator)
                     return simulator
-    SIMULATORS[:] = [*SIMULATORS[-7:], (key, make_simulator(cfgs, scenes, **options))]
+    SIMULATORS[:] = [*SIMULATORS[-23:], (key, make_simulator(cfgs, scenes, **options))]
     return SIMULATORS[-1][1]

@@ -85,9 +85,6 @@ def test_ids_are_those_of_the_conf_folder() -> None:
     assert {env_id for env_id in gymnasium.registry if env_id.startswith("plab/")} == expected
 
 
-# ------------------------------------------------------------------------------------------ one environment
-
-
 def test_checkers_find_nothing(env: PlabEnv) -> None:
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always")
@@ -161,9 +158,6 @@ def test_pictures(env: PlabEnv, vector: PlabVectorEnv, monkeypatch: pytest.Monke
     drawn.close.assert_called_once()
     assert len(PlabVecEnv(vector.batch, render_mode="rgb_array").get_images()) == 2
     vector.batch._close_renderers()
-
-
-# ------------------------------------------------------------------------------------------- vectorisation
 
 
 def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vector: PlabVectorEnv) -> None:
@@ -310,9 +304,6 @@ def test_what_breaks_off_rests_until_the_next_episode(vector: PlabVectorEnv, at:
     assert np.array_equal(batch.step(actions[0]).observation, whole[1].observation)
 
 
-# --------------------------------------------------------------------------------------- stable-baselines3
-
-
 def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
     env = PlabVecEnv(vector.batch, spec=gymnasium.spec("plab/Move-v1"))
     assert env.seed(3) == [3, 4] and env.env_is_wrapped(gymnasium.Wrapper) == [False, False]
@@ -329,9 +320,6 @@ def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
     env.set_options({"start": 1})
     with pytest.raises(ValueError, match="options: start"):
         env.reset()
-
-
-# ----------------------------------------------------------------------------------------------- arguments
 
 
 def test_configurations_of_a_batch() -> None:
@@ -363,9 +351,6 @@ def test_environments_that_cannot_be_are_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(runtime, "_process", os.getpid() + 1)
     with pytest.raises(RuntimeError, match="forked"):
         core.EpisodeBatch(cfgs[:1])
-
-
-# ------------------------------------------------------------------------------------------------- nightly
 
 
 @pytest.mark.nightly

@@ -7,15 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from plab.config import ConfigError, load_config
+from plab.config import ConfigError
 from plab.plugins import exported_module_path, load_object, search_in
-from plab.results import check, read
-from plab.runners import run_batch
-from plab.sweep.execution import plan
-from toy_runner import COARSE
 
 
 @pytest.fixture
@@ -66,37 +61,3 @@ def test_what_is_wrong_is_one_line(folder: Path) -> None:
         with pytest.raises(ConfigError) as caught:
             load_object(text.format(k), int)
         assert named.format(k) in str(caught.value) and "\n" not in str(caught.value)
-
-
-OPTIMISER = """
-from dataclasses import replace
-
-import numpy as np
-
-from plab.config.families import FAMILIES, Rule
-from plab.runners.trajectory import UpdateRule
-
-
-class Signs(UpdateRule):
-    def update(self, actions, gradient):
-        self.state = {"steps": self.state.get("steps", np.zeros(1)) + 1}
-        return actions - self.method.lr / self.state["steps"] * np.sign(gradient)
-
-
-FAMILY = replace(FAMILIES["trajectory"], rules={"signs": Rule(Signs)})
-"""
-
-
-def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folder: Path) -> None:
-    (folder.parent / "zz_signs.py").write_text(OPTIMISER)
-    method = "defaults: [adam, _self_]\nname: signs\nfamily: zz_signs:FAMILY\noptimizer: signs\n"
-    (folder / "method" / "signs.yaml").write_text(method)
-    words = ["method=signs", *COARSE, "method.iterations=3", "progress=false", f"results_dir={folder}"]
-    cfgs = [load_config([*words, f"seed={seed}"], folder) for seed in (0, 1)]
-    with pytest.raises(ConfigError, match=r"method\.optimizer 'adam' .*signs"):
-        load_config([*words, "method.optimizer=adam"], folder)
-    assert plan(cfgs) == [cfgs]
-    assert [one.status for one in run_batch(cfgs)] == ["finished"] * 2
-    for result in (read(cfg.path) for cfg in cfgs):
-        assert result.provenance["batch"] == 2 and np.ptp(result.iterations["loss"]) > 0
-    assert [found for _, found in check(folder)] == ["", ""]

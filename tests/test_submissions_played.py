@@ -102,19 +102,19 @@ def test_steps_of_episodes_that_were_left_count_and_actions_are_clipped(
 
 
 def test_many_environments_in_one_simulator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    own = [["variant=1"], ["variant=1"], ["variant=2"]]
+    own = [["variant=1"], ["variant=1"], ["variant=2"], ["variant=1"]]
     overrides = list(COARSE)
-    envs = gymnasium.make_vec("plab/RollingPin-v1", num_envs=3, overrides=overrides, overrides_per_env=own)
+    envs = gymnasium.make_vec("plab/RollingPin-v1", num_envs=4, overrides=overrides, overrides_per_env=own)
     envs = record(envs, tmp_path)
     # Only the steps of randomised episodes count.
     for options in ({"yield_stress": 30.0}, None):
         envs.reset(options=options)
-        for actions in PLANS.swapaxes(0, 1):
+        for actions in PLANS[[0, 1, 2, 0]].swapaxes(0, 1):
             infos = envs.step(actions)[4]
     assert capsys.readouterr().err.count("randomised episodes") == 1
     scores = infos["score"]
     (one,), (two,) = (read(tmp_path / f"RollingPin-v{v}.plabsub.zip").entries for v in "12")
-    assert (one.steps, one.score, two.steps, two.score) == (24, scores[1], 12, scores[2])
+    assert (one.steps, one.score, two.steps, two.score) == (36, scores[1], 12, scores[2])
     assert np.array_equal(one.actions, PLANS[1]) and np.array_equal(two.actions, PLANS[2])
 
 

@@ -1,18 +1,20 @@
-"""Sweeps of tiny simulated runs: batched runs equal single runs, even if other runs fail."""
+"""Sweeps of tiny simulated runs: batched runs equal single runs, even if others fail; own optimisers."""
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from plab.config import Config, load_config
+from plab.config import Config, ConfigError, load_config
 from plab.problem import Problem
-from plab.results import RunResult, read
+from plab.results import RunResult, check, read
 from plab.runners import run_batch, run_config
 from plab.runners.runner import SimulatorCache
+from plab.sweep.execution import plan
 from same_runs import finished_as, stopped_at
 from toy_runner import COARSE
 
@@ -99,3 +101,42 @@ def test_runs_stopped_at_different_iterations_go_on_together(tmp_path: Path, alo
     assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
     for cfg, want in zip(cfgs, alone, strict=True):
         assert finished_as(cfg, want).provenance["resumed"] == 1
+
+
+OPTIMISER = """
+from dataclasses import replace
+
+import numpy as np
+
+from plab.config.families import FAMILIES, Rule
+from plab.runners.trajectory import UpdateRule
+
+
+class Signs(UpdateRule):
+    def update(self, actions, gradient):
+        self.state = {"steps": self.state.get("steps", np.zeros(1)) + 1}
+        return actions - self.method.lr / self.state["steps"] * np.sign(gradient)
+
+
+FAMILY = replace(FAMILIES["trajectory"], rules={"signs": Rule(Signs)})
+"""
+
+
+def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    folder = tmp_path / "own"
+    (folder / "method").mkdir(parents=True)
+    (tmp_path / "zz_signs.py").write_text(OPTIMISER)
+    method = "defaults: [adam, _self_]\nname: signs\nfamily: zz_signs:FAMILY\noptimizer: signs\n"
+    (folder / "method" / "signs.yaml").write_text(method)
+    words = ["method=signs", *COARSE, "method.iterations=3", "progress=false", f"results_dir={folder}"]
+    cfgs = [load_config([*words, f"seed={seed}"], folder) for seed in range(4)]
+    with pytest.raises(ConfigError, match=r"method\.optimizer 'adam' .*signs"):
+        load_config([*words, "method.optimizer=adam"], folder)
+    assert plan(cfgs) == [cfgs]
+    assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
+    for result in (read(cfg.path) for cfg in cfgs):
+        assert result.provenance["batch"] == 4 and np.ptp(result.iterations["loss"]) > 0
+    assert [found for _, found in check(folder)] == [""] * 4

@@ -17,7 +17,9 @@ import synthetic
 from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
-from same_runs import stopped_at
+from plab.scenes import Scene
+from plab.sim import Simulator
+from same_runs import shared_simulator, stopped_at
 from toy_runner import COARSE, COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,9 +55,6 @@ def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
     return names
 
 
-# --------------------------------------------------------------------------------------- run as they are
-
-
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Compose coarse configurations on the CPU."""
@@ -70,15 +69,20 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for module in ("plab.config", "plab.envs.core"):
         monkeypatch.setattr(f"{module}.load_config", coarse)
 
+    def simulator(scenes: Sequence[Scene], **options: Any) -> Simulator:
+        return shared_simulator([coarse(["task=Move"])] * len(scenes), scenes, **options)
+
+    monkeypatch.setattr("plab.sim.Simulator", simulator)
+
 
 FEWER = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
 """Four environments instead of many."""
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize(("page", "changes"), [("index.md", []), ("../README.md", FEWER[:1])])
-def test_quick_start_and_readme(page, changes):
-    names = run_page(page, *changes)
+@pytest.mark.parametrize(("page", "other"), [("index.md", [("=0.05", "=0.03")]), ("../README.md", FEWER[:1])])
+def test_quick_start_and_readme(page, other):
+    names = run_page(page, *other)
     assert names["result"].gradient.shape == (4, 10, 6)
     assert names.get("envs") is None or names["envs"].num_envs == 4
 
@@ -100,7 +104,12 @@ def test_paper():
 @pytest.mark.usefixtures("small")
 def test_environments():
     """Run the page with one update of the agent."""
-    names = run_page("environments.md", *FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200"))
+    fewer = [*FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200")]
+    fewer += [("num_envs=2", "num_envs=4"), ("[0.0, 0.1]}", "[0.0, 0.1] * 2}")]
+    # Closed environments leave their simulators to others.
+    closed = [("drawn = ", "envs.close()\ndrawn = "), ("inner = ", "seeing.close()\ninner = ")]
+    closed.append(("env = TensorEnv", "envs.close()\nenv = TensorEnv"))
+    names = run_page("environments.md", *fewer, *closed)
     assert names["info"]["score"] >= 0.0
     assert names["infos"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
@@ -121,10 +130,9 @@ def test_results(monkeypatch, tmp_path):
 def test_rendering():
     pytest.importorskip("k3d")
     pytest.importorskip("pyvista")
-    assert run_page("rendering.md")["picture"].shape == (360, 480, 3)
-
-
-# --------------------------------------------------------------------------------------------- own method
+    (words,) = re.findall(r"\[.task=Torus.*?\]", (DOCS / "rendering.md").read_text(encoding="utf-8"))
+    names = run_page("rendering.md", *((old, '["task=Rope"]') for old in (words, '["task=Pinch"]')))
+    assert names["picture"].shape == (360, 480, 3)
 
 
 @pytest.mark.parametrize("excerpt", [*blocks("own_method.md", "python"), *blocks("own_method.md", "yaml")])
@@ -172,9 +180,6 @@ def test_an_interrupted_search_goes_on(tmp_path):
     assert parts.provenance["resumed"] == 1
     assert parts.iterations["loss"].tolist() == whole.iterations["loss"].tolist()
     assert parts.evaluation == whole.evaluation
-
-
-# -------------------------------------------------------------------------------------------- own manipulator
 
 
 def apply(page: str, root: Path) -> None:
