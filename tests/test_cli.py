@@ -138,5 +138,8 @@ def test_a_real_run_and_the_same_command_again(tmp_path, capsys):
     first = subprocess.run(words, capture_output=True, text=True, check=False, env=homeless)
     assert (first.returncode, first.stderr) == (0, "")
     assert main(command) == 0 and "finished before" in capsys.readouterr().out
+    reader, closed = os.pipe()
+    os.close(reader)
+    assert subprocess.run(words, stdout=closed, env=homeless).returncode == 0
     (result,) = (path for path in tmp_path.rglob("*") if path.is_file())
     assert result.parent == tmp_path / "results" / "Rope-v1" / "cem" and result.suffix == ".h5"

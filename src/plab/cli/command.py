@@ -70,9 +70,9 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
             return code
         except SystemExit as stop:
             # Raised by Rich for a closed pipe, and by argparse after --help.
-            return _close_output() if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
+            return close_output() if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
         except BrokenPipeError:
-            return _close_output()
+            return close_output()
         except PlabError as error:
             print_error(str(error))
             return error.exit_code
@@ -127,7 +127,7 @@ def _open_output() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _close_output() -> int:
+def close_output() -> int:
     """Discard further output after standard output was closed; return the exit code."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)

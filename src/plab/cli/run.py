@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
-from plab.cli.command import Parser, command_line, prompt_interrupts
+from plab.cli.command import Parser, close_output, command_line, prompt_interrupts
 from plab.config import EXPERIMENT, GROUPS, ConfigError, choices, conf_folder, load_config
 from plab.config.compose import check_overrides, check_sources, compose_with_hydra, require_runnable
 from plab.config.overrides import parse, prepared
@@ -48,12 +49,19 @@ def main(argv: Sequence[str]) -> int:
         with prompt_interrupts():
             from plab.runners import run_config
 
-        run_config(cfg)
+        try:
+            run_config(cfg)
+            if cfg.progress:
+                result, folder = shlex.quote(str(cfg.path)), shlex.quote(cfg.results_dir)
+                print(f"a picture: plab render {result}; a page of all runs: plab report html {folder}")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # The exit code is that of the run if only its last lines could not be printed.
+            if cfg.force or not cfg.path.exists():
+                raise
+            close_output()
     except KeyboardInterrupt:
         raise KeyboardInterrupt("run the same command again to resume") from None
-    if cfg.progress:
-        result, folder = shlex.quote(str(cfg.path)), shlex.quote(cfg.results_dir)
-        print(f"a picture: plab render {result}; a page of all runs: plab report html {folder}")
     return 0
 
 
