@@ -73,9 +73,6 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-# ------------------------------------------------------------------------------------------- hashes and paths
-
-
 def test_hash_and_path_depend_on_what_can_change_a_result(tmp_path: Path) -> None:
     config = make_config(tmp_path)
     task, sim, method, protocol = (config[name] for name in ("task", "sim", "method", "protocol"))
@@ -118,9 +115,6 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
-# ------------------------------------------------------------------------------------------------- round trip
-
-
 @pytest.mark.parametrize("compress", [False, True])
 def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, compress: bool) -> None:
     config = make_config(tmp_path, variant="4")
@@ -150,9 +144,6 @@ def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, com
     written.config["targets"]["source"] = "files"
     write(written, written.path, compress=compress)
     assert read(written.path).masses.keys() == {"initial", "final"}
-
-
-# --------------------------------------------------------------------------------------------------- resuming
 
 
 def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Generator, caplog) -> None:
@@ -190,9 +181,6 @@ def test_partial_is_written_when_checkpoint_seconds_are_over(tmp_path: Path, rng
     assert len(read(run.partial_path).iterations) == 13
 
 
-# ----------------------------------------------------------------------------------------------------- damage
-
-
 def test_unusable_partials_are_moved_aside(tmp_path: Path, rng, caplog) -> None:
     for _ in range(2):
         run = begin_run(tmp_path, rng)
@@ -213,9 +201,6 @@ def test_truncated_files_are_errors_and_run_again(tmp_path: Path, rng, caplog) -
             read(run.path)
     assert not RunFile(make_config(tmp_path)).finished
     assert run.path.name in caplog.text
-
-
-# ---------------------------------------------------------------------------------------------------- loading
 
 
 def test_load_on_a_mixed_folder(tmp_path: Path, rng) -> None:

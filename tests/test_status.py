@@ -60,9 +60,6 @@ def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder
     assert counts(find(folder, "task=Rope", "sim.particles_scale=0.5"))["done"] == 0
 
 
-# --------------------------------------------------------------------------------------------- runs under way
-
-
 def test_running_is_a_held_lock(folder: Path) -> None:
     path = begin(folder, 3, variant="3")
     assert counts(find(folder))["running"] == 0

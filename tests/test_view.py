@@ -76,9 +76,6 @@ def content(page: str) -> dict[str, Any]:
     return json.loads(re.search(r"const rollout = (.*);", page)[1])
 
 
-# ----------------------------------------------------------------------------------------------- the page
-
-
 def test_the_page_holds_particles_and_manipulators_of_every_frame(recording, page):
     (rope,) = things(page)["plasticine"]
     shown = frames(rope["positions"])
@@ -127,9 +124,6 @@ def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
     assert "</title><b>" not in strange and "&lt;/title&gt;&lt;b&gt;, variant 1" in strange
 
 
-# ------------------------------------------------------------------------------- command line and notebook
-
-
 def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, replayed, page):
     cfg = load_config(["task=Rope", "variant=2", *COARSE])
     numbers = {"status": "finished", "best_actions": ACTIONS}
@@ -174,9 +168,6 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(replaye
         assert np.array_equal(given, expected)
     with pytest.raises(graphics.RenderError, match="own actions"):
         show("seed0.h5", ACTIONS)
-
-
-# ---------------------------------------------------------------------------------------- in the browser
 
 
 def seen(browser) -> tuple[bool, bool]:
