@@ -33,7 +33,8 @@ import pandas as pd
 import yaml
 from IPython.display import HTML, Image, display
 
-from plab.render import RenderError, require_graphics
+from plab.errors import PlabError
+from plab.render import require_graphics
 from plab.report.collect import changed_settings
 from plab.report.figures import PHASES, Drawing, grid, legend, single, style
 from plab.report.methods import method
@@ -181,7 +182,7 @@ if run is not None and run.best_actions is not None:
 
             draw_strip(run.path, picture)
             display(Image(picture.read_bytes(), width=1000, alt="start, target and end"))
-        except RenderError as error:
+        except PlabError as error:
             show_text(f"No pictures: {error}")
 
 # %% [markdown]

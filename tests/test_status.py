@@ -14,11 +14,11 @@ import pytest
 from rich.console import Console
 
 import synthetic
-from plab.cli.status import main
+from plab.cli import status
+from plab.cli.status import main, watch
 from plab.config.selection import select
 from plab.results.running import acquire
-from plab.status import NAMES, STATES, display, survey
-from plab.status.display import watch
+from plab.status import NAMES, STATES, survey
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:
@@ -133,7 +133,7 @@ def test_forms_of_output(folder: Path, told, capsys) -> None:
 def test_all_runs_of_a_sweep_are_shown_until_they_have_ended(folder: Path, monkeypatch) -> None:
     screen = io.StringIO()
     terminal = Console(file=screen, force_terminal=True, width=100, height=14, color_system=None)
-    monkeypatch.setattr(display, "Console", lambda: terminal)
+    monkeypatch.setattr(status, "Console", lambda: terminal)
     lock = acquire(begin(folder, 3, variant="3", seed=1))
     seen: list[str] = []
 

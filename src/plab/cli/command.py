@@ -73,12 +73,12 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
             return close_output() if isinstance(stop.__context__, BrokenPipeError) else int(stop.code or 0)
         except BrokenPipeError:
             return close_output()
-        except PlabError as error:
+        except (PlabError, ArgumentTypeError) as error:
             print_error(str(error))
-            return error.exit_code
+            return getattr(error, "exit_code", PlabError.exit_code)
         except OSError as error:
             reason = error.strerror or str(error)
-            print_error(reason if error.filename is None else f"cannot write {error.filename}: {reason}")
+            print_error(reason if error.filename is None else f"cannot access {error.filename}: {reason}")
         except MemoryError as error:
             print_error(out_of_memory(error))
         except KeyboardInterrupt as error:
@@ -247,9 +247,9 @@ def results_source(text: str) -> Path:
     return resolve(text) if text in EXAMPLES else folder(text)
 
 
-def to_write(text: str) -> Path:
+def to_write(text: str | Path) -> Path:
     """Parse a file name, and check before any computation that the file can be written."""
-    path = folder(text)
+    path = folder(str(text))
     # Missing parent folders are created when writing.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
     if there.is_dir() == (there == path):
@@ -257,14 +257,6 @@ def to_write(text: str) -> Path:
     if not os.access(there, os.W_OK):
         raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
     return path
-
-
-def require_writable(path: Path) -> None:
-    """Raise ArgumentError if a file cannot be written; call before any computation."""
-    try:
-        to_write(str(path))
-    except ArgumentTypeError as error:
-        raise ArgumentError(str(error)) from None
 
 
 # ----------------------------------------------------------------------------------------------------- tables
@@ -300,25 +292,20 @@ def measure_table(
         shown = (f"{value!s:>{width}s}" for value, width in zip(values, least, strict=True))
         print("  ".join(shown), flush=True)
 
-    if path is not None:
-        _write(path, columns, "w")
     table: list[Mapping[str, object]] = []
-    for row in rows:
-        if not table:
-            # Not earlier, so that errors print only one line.
-            show(columns)
-        values = [row[name] for name in columns]
-        show(values)
-        if path is not None:
-            _write(path, values, "a")
-        table.append(row)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path or os.devnull, "w", buffering=1, newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            if not table:
+                # Not earlier, so that errors print only one line.
+                show(columns)
+            show(row[name] for name in columns)
+            writer.writerow(row)
+            table.append(row)
     return table
-
-
-def _write(path: Path, row: Iterable[object], mode: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open(mode, newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerow(row)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text") -> None:

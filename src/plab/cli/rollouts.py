@@ -15,8 +15,8 @@ from plab.cli.command import (
     finished_rows,
     folder,
     positive,
-    require_writable,
     sources_and_words,
+    to_write,
 )
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
@@ -55,7 +55,7 @@ def render(argv: Sequence[str]) -> None:
     parser.add_argument("--size", type=_size, default=(480, 360), metavar="WxH", help=what)
     options = parser.parse_intermixed_args(argv)
     path = resolve_rollout(options, ".png")
-    require_writable(path)
+    to_write(path)
     require_graphics()
     # Imported here and below, because it loads the simulator, which the checks above do not need.
     from plab.render import pictures
@@ -100,7 +100,7 @@ def view(argv: Sequence[str]) -> None:
         output = resolve_rollout(options, ".html")
     if output.suffix.lower() != ".html":
         raise RenderError(f"cannot write {output}: its suffix must be .html")
-    require_writable(output)
+    to_write(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     from plab.render.rollouts import demonstration, record_with_motion
     from plab.results.run_file import replace_file
@@ -145,7 +145,7 @@ def export(argv: Sequence[str]) -> None:
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
     options = parser.parse_intermixed_args(argv)
     output = resolve_rollout(options, f"-{options.format}")
-    require_writable(output / "target")
+    to_write(output / "target")
     if output.is_dir() and any(output.iterdir()):
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
@@ -174,9 +174,8 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
 def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     """Find the rollout without simulating.
 
-    Sets ``result``, the result file or None, and ``config``, the configuration if there is no result; and a
-    default ``output``: beside the result (but not inside an archive) with the suffix ``ending``, or named
-    after the task.
+    Sets ``source``: the result file, or the configuration if there is no result; and a default ``output``:
+    beside the result (but not inside an archive) with the suffix ``ending``, or named after the task.
 
     Returns:
         The output.
@@ -190,19 +189,20 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
 
     sources, words = sources_and_words(options.what, default=None)
     if sources and all(str(one).endswith(ARCHIVE_SUFFIX) or one.is_dir() for one in sources):
-        options.result, name = _best(sources, words)
-        usual = Path(f"{name}{ending}")
+        # Ties are broken as on the results page.
+        found = finished_rows(sources, words)
+        best = min(found, key=lambda row: (-row.values["score"], row.values["config_hash"]))
+        options.source, own = best.path, best.values
+        usual = Path(f"{own['task']}-v{own['variant']}-{own['method']}-seed{own['seed']}{ending}")
     elif len(sources) > 1 or (sources and words):
         raise RenderError(
             f"name either one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'"
         )
     elif sources:
-        (options.result,) = sources
-        place = Path() if split_archive(options.result) else options.result.parent
-        usual = place / (options.result.stem + ending)
+        (path,) = (options.source,) = sources
+        usual = (Path() if split_archive(path) else path.parent) / (path.stem + ending)
     elif words:
-        options.result = None
-        cfg = options.config = load_config(words, options.config_dir)
+        cfg = options.source = load_config(words, options.config_dir)
         check_sources(cfg)
         usual = Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
     else:
@@ -211,22 +211,13 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     return options.output
 
 
-def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
-    """Return path and name of the selected finished run with the highest score."""
-    # Ties are broken as on the results page.
-    rows = finished_rows(sources, words)
-    best = min(rows, key=lambda row: (-row.values["score"], row.values["config_hash"]))
-    task, variant, method, seed = (best.values[name] for name in ("task", "variant", "method", "seed"))
-    return best.path, f"{task}-v{variant}-{method}-seed{seed}"
-
-
 def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
     """Return configuration and actions, shape [T, A], of the rollout found by :func:`resolve_rollout`."""
     from plab.render import rollouts
 
-    if options.result:
-        return rollouts.result(options.result)
-    return options.config, rollouts.demonstration(options.config)
+    if isinstance(options.source, Path):
+        return rollouts.result(options.source)
+    return options.source, rollouts.demonstration(options.source)
 
 
 def _size(text: str) -> tuple[int, int]:

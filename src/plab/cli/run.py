@@ -8,6 +8,7 @@ import sys
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -30,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
     words, config_dir = prepared(options.overrides), options.config_dir
     if options.help or options.help_all:
         check_overrides([], config_dir)
-        print((full_help_text if options.help_all else help_text)(config_dir))
+        print(help_text(config_dir, full=options.help_all))
         return 0
     check_overrides(words, config_dir)
     if options.cfg:
@@ -104,77 +105,26 @@ def parser() -> Parser:
 
 # ------------------------------------------------------------------------------------------------------- help
 
-_USAGE = """\
-plab run [KEY=VALUE ...] [-m]
-
-Runs one task, variant, method and seed, and writes one result file into results_dir. Repeat the
-command to resume an interrupted run; finished runs are skipped.
-
-EXAMPLES
-  plab run task=Rope method=adam seed=0
-  plab run task=Move variant=3 method=gd method.lr=50
-  plab run sim.particles_scale=0.2 method.iterations=20        a quick trial
-  plab run -m variant=1,2,3,4,5 seed=0,1,2                     fifteen runs in one simulator
-  plab run -m task=Move method=sac,ppo method.episodes=2000    a key of both methods
-  plab run +experiment=yield_ablation                          a sweep defined in a file
-"""
-
-_MORE_EXAMPLES = """\
-MORE EXAMPLES
-  plab run sim=reference sim.device=cuda                       float64 on the GPU
-  plab run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
-  plab run -m variant=random 'seed_scene=range(10)'            ten random scenes
-  plab run task=Torus method=ppo method.profile=paper          reinforcement learning
-  plab run --config-dir mine task=Dumbbell                     the task of mine/task/Dumbbell.yaml
-  plab run +experiment=smoke hydra/launcher=batch_joblib       in several processes
-"""
-
-_FLAGS = """\
-FLAGS
-  -m, --multirun    run all combinations of comma-separated values
-  --cfg job         print the configuration and stop; with --package sim, only that section
-  --config-dir DIR  use the YAML files in DIR/task, DIR/method, DIR/sim and DIR/experiment, too
-  -h, --help        this text
-  --help-all        more examples, and the files of all choices with every key and its default
-"""
-
-_KEYS = """\
-FREQUENT KEYS, with their defaults
-  variant=1                 variant of the task; random: sampled with seed_scene
-  seed=0                    seed of the method
-  method.iterations=200     number of updates of the actions
-  method.lr=0.1             learning rate
-  sim.device=cpu            cpu or cuda
-  sim.particles_scale=1.0   factor on the number of particles, below 1 for quick trials
-  results_dir=results       folder of the result files
-  force=false               true: recompute and replace an existing result
-  logger=none               none, tensorboard or wandb
-"""
-
-_WIDTH = 100
+_HELP = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8")
 
 
-def help_text(config_dir: str | None = None) -> str:
+def help_text(config_dir: str | None = None, *, full: bool = False) -> str:
     """Return the two-screen text of ``--help``: usage, flags, names of all choices, including the user's
-    files in ``config_dir``, and frequent keys."""
-    parts = [_USAGE, _FLAGS, "CHOICES"]
+    files in ``config_dir``, and frequent keys. The ``full`` text of ``--help-all`` has more examples, and the
+    commented YAML file of each choice, with every key and its default."""
+    names, yaml = [], {"config": conf_folder() / "config.yaml"}
     for group in (*GROUPS, EXPERIMENT):
-        start = f"  {'+' if group == EXPERIMENT else ''}{group}="
-        names = ", ".join(choices(group, config_dir))
-        parts += textwrap.wrap(names, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
-    return "\n".join([*parts, "", _KEYS.rstrip()])
-
-
-def full_help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help-all``: ``--help``, more examples, and the commented YAML file of each
-    choice, with every key and its default."""
+        start, found = f"{'+' if group == EXPERIMENT else ''}{group}=", choices(group, config_dir)
+        indent = " " * (2 + len(start))
+        names += textwrap.wrap(", ".join(found), 100, initial_indent=f"  {start}", subsequent_indent=indent)
+        yaml |= {f"{start}{name}": path for name, path in found.items()}
+    shown, title, more = _HELP.partition("MORE EXAMPLES\n")
+    shown = shown.replace("{choices}", "\n".join(names)).rstrip()
+    if not full:
+        return shown
     head = "FILES; their keys are below the name of the group, such as method.lr"
-    parts = [help_text(config_dir), _MORE_EXAMPLES, head]
-    files = {"config": conf_folder() / "config.yaml"}
-    for group in (*GROUPS, EXPERIMENT):
-        sign = "+" if group == EXPERIMENT else ""
-        files |= {f"{sign}{group}={name}": path for name, path in choices(group, config_dir).items()}
-    for title, path in files.items():
+    parts = [f"{shown}\n{title}{more}", head]
+    for name, path in yaml.items():
         text = path.read_text(encoding="utf-8").removeprefix("# @package _global_\n").rstrip()
-        parts.append(f"\n{title}\n{textwrap.indent(text, '  ')}")
+        parts.append(f"\n{name}\n{textwrap.indent(text, '  ')}")
     return "\n".join(parts)

@@ -71,10 +71,7 @@ def submit(argv: Sequence[str]) -> None:
         parser.error("--policy and --steps must be used together")
     if options.unseen and not options.policy:
         parser.error("--unseen requires --policy")
-    try:
-        card = parse_card(options.card.read_bytes(), str(options.card))
-    except OSError as error:
-        raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
+    card = parse_card(options.card.read_bytes(), str(options.card))
     if options.policy:
         variants = (*SUITE_VARIANTS, *UNSEEN) if options.unseen else SUITE_VARIANTS
         entries, files = from_policies(dict(options.policy), variants, options.steps, words)

@@ -34,9 +34,10 @@ def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
 
 
 def variants(task: str, overrides: Sequence[str]) -> list[Config]:
-    """Return the configurations of a task's variants, after checking the first one."""
+    """Return the checked configurations of a task's variants."""
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
-    check_sources(cfgs[0])
+    for cfg in cfgs:
+        check_sources(cfg)
     return cfgs
 
 
@@ -66,8 +67,17 @@ def demonstrations(argv: Sequence[str]) -> None:
     options = _options(parser, argv)
     tasks = [variants(task, options.overrides) for task in options.task]
     replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
-    rows = [_row(item) for item in replays]
-    print_table(list(rows[0]), [list(row.values()) for row in rows])
+    columns = (
+        "task",
+        "variant",
+        "target",
+        "steps",
+        "IoU at start",
+        "IoU of target",
+        "score",
+        "score at rest",
+    )
+    print_table(columns, map(_row, replays))
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
@@ -82,18 +92,11 @@ def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list
     return [ReplayedDemonstration(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
 
 
-def _row(item: ReplayedDemonstration) -> dict[str, str]:
-    moving = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0)
-    return {
-        "task": item.cfg.task.name,
-        "variant": item.cfg.variant,
-        "target": item.cfg.task.target["recipe"],
-        "steps": str(int(moving[-1]) + 1 if len(moving) else 0),
-        "IoU at start": f"{item.scores.iou_initial:.3f}",
-        "IoU of target": f"{item.scores.iou_target_self:.3f}",
-        "score": f"{item.scores.score:.3f}",
-        "score at rest": f"{item.idle.score:.3f}",
-    }
+def _row(item: ReplayedDemonstration) -> list[str]:
+    steps = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0).max(initial=-1) + 1
+    named = [item.cfg.task.name, item.cfg.variant, item.cfg.task.target["recipe"], str(steps)]
+    judged = item.scores.iou_initial, item.scores.iou_target_self, item.scores.score, item.idle.score
+    return [*named, *(f"{number:.3f}" for number in judged)]
 
 
 # --------------------------------------------------------------------------------------------------- targets
@@ -139,10 +142,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         mean distance of the initial mass from the target [domain units], average build time [s].
     """
     cfgs = variants(task, overrides)
-    for cfg in cfgs:
-        check_sources(cfg)
-    sim = cfgs[0].sim
-    scenes = [build_scene(cfg) for cfg in cfgs]
+    sim, scenes = cfgs[0].sim, [build_scene(cfg) for cfg in cfgs]
     start = time.perf_counter()
     simulator = Simulator(scenes, precision=sim.precision, device=sim.device)
     masses = make_targets(cfgs, simulator, rebuild=rebuild)

@@ -409,25 +409,27 @@ class EpisodeBatch:
         self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
         if changed or self.randomizer.changed or environments is not None or on_device(like):
-            measured = self._measured(like)
-            if changed:
-                self._note_starts(rows, *measured[:2])
-            others = [e for e in range(self.size) if e not in rows]
-            self._update(self._observe(like), measured, kept=others)
+            self._restart(rows, like, changed)
         else:
             self._last = self._initial
         # Copies, because callers may keep and modify them.
         self._last = _copies(self._last)
         return self._shown()
 
-    def _note_starts(self, rows: Sequence[int], terms: Array, iou: Array) -> None:
-        """Record the current states as initial states for scores and rewards."""
-        self._changes = self._simulator.changes
-        self.problem.note_starts(rows, _on_host(iou))
-        loss = self._initial_loss.like(None).copy()
-        loss[rows] = _on_host(self.problem.loss_of(terms))[rows]
-        self._initial_loss = Constants(loss)
-        self._refresh_views()
+    def _restart(self, rows: Sequence[int], like: Array, changed: bool) -> None:
+        """Measure and observe the current states of some environments; if their scenes or targets have
+        ``changed``, record them as initial states for scores and rewards."""
+        measured = self._measured(like)
+        if changed:
+            terms, iou, _ = measured
+            self._changes = self._simulator.changes
+            self.problem.note_starts(rows, _on_host(iou))
+            loss = self._initial_loss.like(None).copy()
+            loss[rows] = _on_host(self.problem.loss_of(terms))[rows]
+            self._initial_loss = Constants(loss)
+            self._refresh_views()
+        others = [e for e in range(self.size) if e not in rows]
+        self._update(self._observe(like), measured, kept=others)
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
         """Store observations and measures, as arrays or CUDA tensors, except for some environments."""
@@ -503,10 +505,7 @@ class EpisodeBatch:
         if rows:
             stages.earned[rows] = _on_host(reward)[rows]
             stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
-            measured = self._measured(like)
-            self._note_starts(rows, *measured[:2])
-            others = [e for e in range(self.size) if e not in rows]
-            self._update(self._observe(like), measured, kept=others)
+            self._restart(rows, like, changed=True)
         info |= self._stage_info(info["score"])
         return reward
 

@@ -294,17 +294,15 @@ def coarse_shares(mass: np.ndarray) -> np.ndarray:
 
 def _shares(x: Array) -> Array:
     """Return the fraction of particles, shape [batch, particle, 3], in each cell, float32."""
-    device = on_device(x)
-    cell = ((x * CELLS).long() if device else (x * CELLS).astype(np.int64)).clip(0, CELLS - 1)
-    flat = (cell[..., 0] * CELLS + cell[..., 1]) * CELLS + cell[..., 2]
-    whole, batch, size = CELLS**3, len(x), x.shape[1]
-    if device:
-        import torch
+    import torch
 
-        flat = (flat + whole * torch.arange(batch, device=x.device)[:, None]).reshape(-1)
-        return (torch.bincount(flat, minlength=batch * whole).float() / size).reshape(batch, *(CELLS,) * 3)
-    counts = np.bincount((flat + whole * np.arange(batch)[:, None]).reshape(-1), minlength=batch * whole)
-    return (counts / size).astype(np.float32).reshape(batch, *(CELLS,) * 3)
+    batch, size, _ = x.shape
+    cell = (torch.as_tensor(x) * CELLS).long().clip(0, CELLS - 1)
+    first = torch.arange(batch, device=cell.device)[:, None] * CELLS
+    flat = ((first + cell[..., 0]) * CELLS + cell[..., 1]) * CELLS + cell[..., 2]
+    counts = torch.bincount(flat.reshape(-1), minlength=batch * CELLS**3)
+    shares = (counts.float() / size).reshape(batch, *(CELLS,) * 3)
+    return shares if on_device(x) else shares.numpy()
 
 
 def _sampled(mass: np.ndarray, count: int) -> np.ndarray:

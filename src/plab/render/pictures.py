@@ -7,21 +7,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from plab.config import ConfigError
+from plab.errors import PlabError
 from plab.files import UNFINISHED, complete_folder
 from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
 from plab.render.rollouts import RecordedRollout, record, result
-from plab.results import ResultsError
-from plab.scenes import SceneError
-from plab.sim import DeviceError, SimulationError
-from plab.targets import TargetError
+from plab.results.run_file import replace_file
 
 STEPS_PER_SECOND = 20
 """Environment steps per second of a film."""
@@ -34,10 +32,6 @@ _FILM_COLORS = 96  # of a GIF
 _SET_EVERY = 2  # environment steps between frames of a set
 
 _PAGE_SIZE = (480, 360)
-_RENDER_ERRORS = (
-    *(RenderError, ResultsError, ConfigError, SceneError, TargetError),
-    *(DeviceError, SimulationError),
-)
 
 
 def check_output(path: Path) -> None:
@@ -59,15 +53,18 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         every: Environment steps between frames of a film.
     """
     write = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}[path.suffix.lower()]
-    with _renderer(recording, size) as renderer, _writing(path) as fresh:
+    # In another folder, so that the file appears complete.
+    with _renderer(recording, size) as renderer, TemporaryDirectory() as place:
+        fresh = Path(place, path.name)
         write(recording, renderer, every, fresh)
+        replace_file(path, fresh.read_bytes())
 
 
 def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *, film: bool) -> None:
     """Write pictures of a rollout with a size [pixels, even numbers]: ``start.webp``, ``target.webp`` and the
     final state ``end.webp``; and a film ``end.mp4``, if requested and imageio-ffmpeg is installed."""
     first, last = recording.poses[0], recording.poses[-1]
-    with _renderer(recording, size) as renderer, _writing(folder / "end"):
+    with _renderer(recording, size) as renderer:
         pictures = {"start": renderer.frame(recording.x[0], first), "target": renderer.target(first)}
         pictures["end"] = renderer.frame(recording.x[-1], last)
         for what, picture in pictures.items():
@@ -83,22 +80,6 @@ def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Ren
     x, poses = recording.x[[0, -1]].reshape(-1, 3), recording.poses[::5]
     with closing(Renderer(scene, mass, size, scene_camera(scene, mass, size, x, poses))) as renderer:
         yield renderer
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[Path]:
-    """Create the folder of a file, and yield a temporary path that replaces the file on success; raise
-    RenderError if the file cannot be written."""
-    fresh = path.with_name(f"{UNFINISHED}{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield fresh
-        if fresh.exists():
-            fresh.replace(path)
-    except OSError as error:
-        raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 # ---------------------------------------------------------------------------------------------------- formats
@@ -118,7 +99,7 @@ def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: 
     frames = list(_frames(recording, renderer, every))
     # One palette for all frames, so that unchanged parts compress well.
     some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
-    palette = _with_palette(Image.fromarray(some), _FILM_COLORS)
+    palette = Image.fromarray(some).quantize(_FILM_COLORS, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration = [1000 * every // STEPS_PER_SECOND] * (len(images) - 1) + [round(1000 * _HOLD)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
@@ -146,10 +127,6 @@ def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Itera
     last = len(recording.x) - 1
     for step in [*range(0, last, every), last]:
         yield renderer.frame(recording.x[step], recording.poses[step])
-
-
-def _with_palette(picture: Image.Image, colors: int) -> Image.Image:
-    return picture.quantize(colors, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
 
 
 def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
@@ -192,7 +169,7 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
             path, film = wanted[folder]
             try:
                 recording = record(*result(path))
-            except _RENDER_ERRORS as error:
+            except PlabError as error:
                 troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue
             with complete_folder(folder) as fresh:
@@ -204,10 +181,7 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
 
 
 def draw_strip(path: Path, picture: Path) -> None:
-    """Replay a run from its result file, and write initial state, target and final state side by side as PNG;
-    raise RenderError on failure."""
+    """Replay a run from its result file, and write initial state, target and final state side by side as
+    PNG."""
     require_graphics()
-    try:
-        save(record(*result(path)), picture, _PAGE_SIZE)
-    except _RENDER_ERRORS as error:
-        raise RenderError(str(error)) from error
+    save(record(*result(path)), picture, _PAGE_SIZE)

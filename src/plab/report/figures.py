@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -40,21 +40,6 @@ from plab.results.run_file import replace_file
 PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
 """Phases of a run, with their colours."""
 
-_STYLE = {
-    "pdf.fonttype": 42,  # TrueType: embedded text, accepted by journals
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E0E0E0",
-    "lines.linewidth": 1.3,
-    "legend.frameon": False,
-    "savefig.dpi": 200,
-    "figure.constrained_layout.use": True,
-}
-
 
 @dataclass(frozen=True)
 class Drawing:
@@ -76,7 +61,7 @@ class Drawing:
 @contextmanager
 def style() -> Iterator[None]:
     """Use plab's Matplotlib style inside the ``with`` block."""
-    with matplotlib.rc_context(cast(Any, _STYLE)):
+    with matplotlib.rc_context(fname=Path(__file__).with_name("plab.mplstyle")):
         yield
 
 

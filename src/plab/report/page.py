@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
@@ -287,9 +287,6 @@ def render(template: str, package: str = _OWN, **values: Any) -> str:
         package: Package with the template in its folder ``web``.
         **values: Variables of the template.
     """
-
-    def load(file: str) -> str:
-        return asset(file, package if file == template else _OWN)
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, loader=FunctionLoader(load))
+    loader = ChoiceLoader([PackageLoader(name, "web") for name in (package, _OWN)])
+    environment = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
     return environment.get_template(template).render(**values)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from plab.config.families import SOLVED, known_family
 from plab.report.collect import Runs
 from plab.report.methods import method
 from plab.results import BUDGETS as SIMULATED
-from plab.results import read, read_curves
+from plab.results import read_curves
 
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""
@@ -252,12 +251,6 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
     names = runs.table[["task", "variant", "method", "seed"]].astype(str).to_dict("records")
     found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]))
     return list(zip(names, found, strict=True))
-
-
-def load_rows(path: str | Path) -> Rows:
-    """Return the iterations of one run, with the columns of :func:`load_series`."""
-    run = read(path)
-    return rows_on_axes(run.config, run.columns)
 
 
 def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:

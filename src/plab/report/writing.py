@@ -63,7 +63,8 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
         numbers = table.data.to_csv(index=False, lineterminator="\n")
         replace_file(path.with_suffix(".csv"), "".join(f"# {line}\n" for line in made) + numbers)
     inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in tables)
-    replace_file(out / "tables.tex", _DOCUMENT.replace("INPUTS", inputs))
+    document = (Path(__file__).parent / "web/tables.tex").read_text(encoding="utf-8")
+    replace_file(out / "tables.tex", document.replace("INPUTS", inputs))
     replace_file(out / "tables.md", "\n".join([*map(markdown, tables), *(f"{line}  " for line in made), ""]))
     replace_file(out / "runs.json", json.dumps(origin(runs, command), indent=1) + "\n")
     return tables
@@ -115,18 +116,6 @@ def _footer(runs: Runs, command: str) -> list[str]:
 
 
 # ----------------------------------------------------------------------------------------- formats of tables
-
-_DOCUMENT = r"""% pdflatex tables.tex, twice: long tables align their columns the second time.
-\documentclass{article}
-\usepackage[utf8]{inputenc}
-\usepackage[a4paper, margin=1.5cm]{geometry}
-\usepackage{booktabs}
-\usepackage{graphicx}
-\usepackage{longtable}
-\begin{document}
-INPUTS
-\end{document}
-"""
 
 _LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"} | {sign: f"\\{sign}" for sign in "&%$#_{}"}
 _TO_LATEX = str.maketrans(_LATEX_SIGNS)

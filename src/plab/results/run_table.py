@@ -270,7 +270,10 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
                 # The same folder may have another path in the next call.
                 yield Row(values | {"path": str(path / member)}, config)
             continue
-        own = _read(path)
+        own = list(read_rows(path))
+        if not path.exists():
+            # The run has ended since the folder was listed.
+            own = list(read_rows(_final(path))) if _final(path).exists() else []
         yield from own
         found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
         # Damaged files are read again, because the message is part of the result.
@@ -285,14 +288,6 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
 
 def _final(partial: Path) -> Path:
     return partial.with_name(partial.name.removesuffix(PARTIAL_SUFFIX) + SUFFIX)
-
-
-def _read(path: Path) -> list[Row | ResultsError]:
-    """Return the rows of a file, or of the final file if it has replaced the partial file."""
-    entries = list(read_rows(path))
-    if not path.exists():
-        return list(read_rows(_final(path))) if _final(path).exists() else []
-    return entries
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:

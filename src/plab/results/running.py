@@ -75,11 +75,15 @@ class RunFile:
         self._lock: Lock | None = None
         # Number of iterations of earlier processes.
         self._known = 0
-        earlier = self._finished_earlier()
-        if earlier is not None and not config["force"]:
+        earlier = None if config["force"] else self._finished_earlier()
+        if earlier is not None:
             self._state = earlier, ()
-            if lock_path(self.path).exists() or self.partial_path.exists():
-                self._remove_leftovers()
+            # Left by a process that was killed just after finishing; a locked run is being recomputed.
+            with suppress(OSError):
+                if lock_path(self.path).exists() or self.partial_path.exists():
+                    if (lock := acquire(self.path)) is not None:
+                        self._remove(REPLAY_SUFFIX, PARTIAL_SUFFIX)
+                        lock.release()
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,14 +112,6 @@ class RunFile:
         if not self.partial_path.exists():
             # A run in progress has a file from the start, for plab status and to detect a full disk.
             write(self.result, self.partial_path)
-
-    def _remove_leftovers(self) -> None:
-        """Remove files left by a process that was killed just after finishing the run."""
-        # Errors of removal are ignored. If the lock is held, the run is being recomputed.
-        with suppress(OSError):
-            if (lock := acquire(self.path)) is not None:
-                self._remove(REPLAY_SUFFIX, PARTIAL_SUFFIX)
-                lock.release()
 
     def _remove(self, *suffixes: str) -> None:
         """Remove temporary files of the run, and files with the given suffixes."""

@@ -122,9 +122,7 @@ def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -
                 if len(groups) == 1:
                     kind(party, note, cache).run()
                 else:
-                    parties[:0] = (
-                        [groups[key] for key in sorted(groups)] if own.batching else [*groups.values()]
-                    )
+                    parties[:0] = [groups[key] for key in sorted(groups)]
             except TogetherError:
                 left = [track for track in party if track.open]
                 half = len(left) if len(left) < len(party) else len(left) // 2

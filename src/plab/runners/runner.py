@@ -550,9 +550,6 @@ def simulation_errors(when: str = "") -> Iterator[None]:
 
 # ------------------------------------------------------------------------------------------------------- logs
 
-PROJECT = "plab"
-"""Default project name at Weights & Biases; ``WANDB_PROJECT`` overrides it."""
-
 
 class RunLog:
     """Log of a run beside its file, selected by ``logger`` and opened on first use.
@@ -605,14 +602,14 @@ class RunLog:
 
     def _wandb(self, _steps: int) -> tuple[Callable[..., object], Callable[[], object]]:
         """Start a run at Weights & Biases, or resume the run of the same configuration. Its files are in the
-        folder ``wandb`` of ``results_dir``; ``WANDB_MODE`` and wandb's other environment variables apply."""
+        folder ``wandb`` of ``results_dir``; ``WANDB_PROJECT``, ``WANDB_MODE`` and other variables apply."""
         import wandb
 
         cfg = self._cfg
         name = f"{cfg.task.name}-v{cfg.variant}-{cfg.method.name}-{self._run.path.stem}"
         try:
             begun = wandb.init(
-                project=os.environ.get("WANDB_PROJECT") or PROJECT,
+                project=os.environ.get("WANDB_PROJECT") or "plab",
                 name=name,
                 # Ids are limited to 128 characters.
                 id=re.sub(r"[^\w.-]", "_", name)[:128],

@@ -25,9 +25,9 @@ from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
 from plab.errors import print_error
 from plab.files import UnreadableError
-from plab.render import RenderError, rollouts
-from plab.report.statistics import BUDGETS, load_rows
-from plab.results import ResultsError, Row
+from plab.render import rollouts
+from plab.report.statistics import BUDGETS, rows_on_axes
+from plab.results import ResultsError, Row, read_curves
 from plab.results.run_file import explained, replace_file
 from plab.results.run_table import rows
 from plab.results.running import now
@@ -100,8 +100,14 @@ def verify(
         chosen = [cfgs[entry.configuration] for entry in entries]
         plans = [entry.actions for entry in entries if entry.actions is not None]
         actor = load_policy(name, submission.policies[name]) if name else plans
-        for entry, played in zip(entries, play(chosen, actor, name), strict=True):
-            verdicts[id(entry)] = _verdict(entry, *played)
+        for entry, (score, failure) in zip(entries, play(chosen, actor, name), strict=True):
+            claim = f"{entry.name}: claims {entry.score:.4f}, scores {score:.4f}"
+            outcome, why = LIES, f"{claim} (tolerance {TOLERANCE})"
+            if failure:
+                outcome, why = BROKE_OFF, f"{entry.name}: the simulation diverged, {failure}"
+            elif abs(score - entry.score) <= TOLERANCE:
+                outcome, why = HOLDS, ""
+            verdicts[id(entry)] = Verdict(entry, score, outcome, why)
     why = "policies were not run; --run-policies runs them"
     return [verdicts.get(id(one), Verdict(one, math.nan, NOT_RUN, why)) for one in submission.entries]
 
@@ -134,15 +140,6 @@ def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configu
 def _composed(one: Configuration, overrides: tuple[str, ...]) -> tuple[Config, str]:
     cfg = one.config(overrides)
     return cfg, checksum(cfg)
-
-
-def _verdict(entry: Entry, score: float, failure: str) -> Verdict:
-    if failure:
-        return Verdict(entry, score, BROKE_OFF, f"{entry.name}: the simulation diverged, {failure}")
-    if abs(score - entry.score) <= TOLERANCE:
-        return Verdict(entry, score, HOLDS)
-    why = f"{entry.name}: claims {entry.score:.4f}, scores {score:.4f} (tolerance {TOLERANCE})"
-    return Verdict(entry, score, LIES, why)
 
 
 # ---------------------------------------------------------------------------------------------- simulation
@@ -206,7 +203,17 @@ def load_policy(name: str, content: bytes) -> Policy:
     if name.endswith(".onnx") and find_spec("onnxruntime") is None:
         raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
     try:
-        policy = (_torchscript if name.endswith(".pt") else _onnx)(content)
+        if name.endswith(".pt"):
+            import torch
+
+            module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+            policy: Policy = torch.no_grad()(lambda seen: module(torch.from_numpy(seen)).numpy())
+        else:
+            import onnxruntime
+
+            session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+            (given,) = session.get_inputs()
+            policy = lambda seen: session.run(None, {given.name: seen})[0]  # noqa: E731
     # PyTorch, ONNX Runtime and the policy's own code raise errors of any class; likewise below.
     except Exception as error:
         raise SubmissionError(f"{name} cannot be loaded ({_reason(error)})") from None
@@ -221,26 +228,6 @@ def load_policy(name: str, content: bytes) -> Policy:
         return np.clip(actions, -1.0, 1.0)
 
     return answer
-
-
-def _torchscript(content: bytes) -> Policy:
-    import torch
-
-    module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-
-    def policy(observations: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return module(torch.from_numpy(observations)).numpy()
-
-    return policy
-
-
-def _onnx(content: bytes) -> Policy:
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    (given,) = session.get_inputs()
-    return lambda observations: session.run(None, {given.name: observations})[0]
 
 
 def _reason(error: Exception) -> str:
@@ -453,12 +440,10 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
 
 def _of_run(row: Row) -> Entry:
     """Return the best actions of a run."""
-    try:
-        cfg, actions = rollouts.stored(row.path)
-    except RenderError as error:
-        raise SubmissionError(str(error)) from None
+    cfg, actions = rollouts.stored(row.path)
     score = row.values["score_best"]
-    steps = int(load_rows(row.path)["simulated"][row.values["best_iteration"]])
+    (columns,) = read_curves([row.path])
+    steps = int(rows_on_axes(row.config, columns)["simulated"][row.values["best_iteration"]])
     return Entry(configuration_of(cfg), checksum(cfg), steps, score, actions)
 
 
@@ -477,17 +462,15 @@ def from_policies(
         The entries, and the policy files by name in the submission.
 
     Raises:
-        SubmissionError: If a policy cannot be read or run, or the simulation diverges.
+        SubmissionError: If a policy cannot be run, or the simulation diverges.
+        OSError: If its file cannot be read.
         plab.config.ConfigError: If an override is invalid.
     """
     entries: list[Entry] = []
     files: dict[str, bytes] = {}
     for task, path in policies.items():
         name = f"policies/{task}{path.suffix}"
-        try:
-            files[name] = path.read_bytes()
-        except OSError as error:
-            raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
+        files[name] = path.read_bytes()
         cfgs = [Configuration(task, variant).config(overrides) for variant in variants]
         played = play(cfgs, load_policy(name, files[name]), str(path))
         for cfg, (score, failure) in zip(cfgs, played, strict=True):

@@ -31,18 +31,17 @@ from plab.config.compose import check_sources, choices, compose, finish, hydra_a
 from plab.config.families import family
 from plab.config.overrides import parse, swept
 from plab.config.selection import OBSERVATION_KEYS
-from plab.errors import print_error
+from plab.errors import PlabError, print_error
 from plab.plugins import exported_module_path
 from plab.problem import build_scenes
 from plab.results import ResultsError, RunFile, read, row_count
 from plab.results.run_file import PARTIAL_SUFFIX
 from plab.results.running import held, lock_path
 from plab.runners.runner import Outcome, SimulatorCache, report
-from plab.scenes import Scene, SceneError
+from plab.scenes import Scene
 from plab.sim.batch import scene_kind
 from plab.sim.memory import batch_limit, most_environments
 from plab.sim.runtime import cuda_devices
-from plab.targets import TargetError
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
@@ -153,7 +152,7 @@ def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
     try:
         cfg = finish(compose(words, config_dir), words, alone=False)
         check_sources(cfg)
-    except (ConfigError, SceneError, TargetError) as error:
+    except PlabError as error:
         return str(error)
     return cfg
 
