@@ -255,11 +255,8 @@ def main(argv: Sequence[str]) -> None:
 
     parser = Parser("plab bench accuracy", __doc__)
     add = parser.add_argument
-    add(
-        "--quick",
-        action="store_true",
-        help="coarser, fewer settings, 1000 particles instead of 10000, 20 steps",
-    )
+    text = "coarser, fewer settings, 1000 particles instead of 10000, 20 steps"
+    add("--quick", action="store_true", help=text)
     text = f"tasks, comma-separated (all; {','.join(QUICK_TASKS)} with --quick)"
     add("--task", type=task_list, help=text)
     add("--device", choices=DEVICES, default="cpu", help="cpu or cuda")

@@ -110,7 +110,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--observe", default="state", metavar="NAME,...", help="observations of --policy")
     parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="number of scenes")
     parser.add_argument(
-        "--together", type=positive, default=25, metavar="N", help="number of scenes simulated together"
+        "--together", type=positive, default=25, metavar="N", help="scenes simulated at a time"
     )
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)

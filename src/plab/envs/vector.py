@@ -58,11 +58,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
         self.render_mode = check_render_mode(render_mode)
-        try:
-            self._mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            names = ", ".join(mode.value for mode in AutoresetMode)
-            raise ArgumentError(f"autoreset_mode '{autoreset_mode}' is not one of {names}") from None
+        self._mode = AutoresetMode(autoreset_mode)
         self.metadata = METADATA | {"autoreset_mode": self._mode}  # type: ignore[misc]
         self.batch = make_batch(task, variant, num_envs=num_envs, **options)
         self.num_envs = num_envs

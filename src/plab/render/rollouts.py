@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
 from plab.errors import print_error
-from plab.problem import Problem, build_scenes, make_simulator
+from plab.problem import Problem, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scenes import Scene
@@ -121,7 +121,7 @@ def demonstration(cfg: Config) -> np.ndarray:
 def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
     problem = Problem([cfg])
-    return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions)
+    return _recording(cfg, problem.simulator, problem, actions)
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
@@ -133,21 +133,14 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
         problem = Problem([cfg])
     except TargetError as error:
         print_once(f"without target and scores: {error}")
-        scenes = build_scenes([cfg])
-        return _recording(cfg, scenes[0], make_simulator(cfg, scenes), None, actions, motion=True)
+        return _recording(cfg, make_simulator([cfg]), None, actions, motion=True)
     if cfg.targets.source is not None:
         print_once(f"the output contains your target file from {cfg.targets.source}: check its licence")
-    return _recording(cfg, problem.scenes[0], problem.simulator, problem, actions, motion=True)
+    return _recording(cfg, problem.simulator, problem, actions, motion=True)
 
 
 def _recording(
-    cfg: Config,
-    scene: Scene,
-    simulator: Simulator,
-    problem: Problem | None,
-    actions: np.ndarray,
-    *,
-    motion: bool = False,
+    cfg: Config, simulator: Simulator, problem: Problem | None, actions: np.ndarray, *, motion: bool = False
 ) -> RecordedRollout:
     """Simulate actions, shape [T, A], and record target and scores if a problem is given."""
     states, scores = [], []
@@ -163,7 +156,7 @@ def _recording(
     return RecordedRollout(
         task=cfg.task.name,
         variant=cfg.variant,
-        scene=scene,
+        scene=simulator.scenes[0],
         target_mass=None if problem is None else problem.target_mass[0],
         scores=None if problem is None else np.array(scores),
         **{name: np.stack([getattr(state, name)[0] for state in states]) for name in names},

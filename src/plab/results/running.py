@@ -73,8 +73,6 @@ class RunFile:
         self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
-        # Number of iterations of earlier processes.
-        self._known = 0
         earlier = None if config["force"] else self._finished_earlier()
         if earlier is not None:
             self._state = earlier, ()
@@ -108,7 +106,6 @@ class RunFile:
         if self.finished:
             self.release()
             return
-        self._known = self._state[0].rows
         if not self.partial_path.exists():
             # A run in progress has a file from the start, for plab status and to detect a full disk.
             write(self.result, self.partial_path)
@@ -146,11 +143,6 @@ class RunFile:
     def finished(self) -> bool:
         """True if this process or an earlier one has completed the run."""
         return self._state[0].status == "finished"
-
-    @property
-    def advanced(self) -> bool:
-        """True if this process has computed an iteration of the run."""
-        return self.result.rows > self._known
 
     def release(self) -> None:
         """Release the run's lock for other processes; nothing may be written afterwards."""

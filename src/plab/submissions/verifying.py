@@ -27,7 +27,7 @@ from plab.errors import print_error
 from plab.files import UnreadableError
 from plab.render import rollouts
 from plab.report.statistics import BUDGETS, rows_on_axes
-from plab.results import ResultsError, Row, read_curves
+from plab.results import Row, read_curves
 from plab.results.run_file import explained, replace_file
 from plab.results.run_table import rows
 from plab.results.running import now
@@ -305,7 +305,7 @@ class _BestEpisodes:
 
         Raises:
             SubmissionError: If the file exists.
-            ResultsError: If it cannot be written.
+            OSError: If it cannot be written.
         """
         self.steps = 0
         self._configuration = configuration_of(cfg)
@@ -320,8 +320,6 @@ class _BestEpisodes:
         except FileExistsError:
             why = "already exists: record into another folder, or remove it"
             raise SubmissionError(f"{path} {why}") from None
-        except OSError as error:
-            raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
     def add(self, actions: np.ndarray, score: float) -> None:
         """Add an episode, given its actions, shape [T, A], and score."""
