@@ -67,17 +67,8 @@ def demonstrations(argv: Sequence[str]) -> None:
     options = _options(parser, argv)
     tasks = [variants(task, options.overrides) for task in options.task]
     replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
-    columns = (
-        "task",
-        "variant",
-        "target",
-        "steps",
-        "IoU at start",
-        "IoU of target",
-        "score",
-        "score at rest",
-    )
-    print_table(columns, map(_row, replays))
+    judged = ["IoU at start", "IoU of target", "score", "score at rest"]
+    print_table(["task", "variant", "target", "steps", *judged], map(_row, replays))
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:

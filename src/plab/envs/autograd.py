@@ -253,7 +253,11 @@ def policy_gradient(
     def react(t: int, actions_bar: Any) -> Any:
         """Add to the gradients of the parameters; return the derivative with respect to the observation."""
         if t == steps:
-            return react_to_value()
+            if value is None:
+                return None
+            with torch.enable_grad():
+                worth = value(seen[-1]).sum()
+            return given(torch.autograd.grad(-(discount**steps) * worth, seen[-1])[0])
         bar = torch.as_tensor(actions_bar).to(like)
         seen_bar, *by_parameter = torch.autograd.grad(done[t], [seen[t], *parameters], bar, allow_unused=True)
         for parameter, part in zip(parameters, by_parameter, strict=True):
@@ -261,14 +265,6 @@ def policy_gradient(
                 part = part / batch.size
                 parameter.grad = part if parameter.grad is None else parameter.grad + part
         return None if seen_bar is None else given(seen_bar)
-
-    def react_to_value() -> Any:
-        if value is None:
-            return None
-        with torch.enable_grad():
-            worth = value(seen[-1]).sum()
-        (seen_bar,) = torch.autograd.grad(-(discount**steps) * worth, seen[-1])
-        return given(seen_bar)
 
     terms = batch.closed_loop(steps, choose, react, discount=discount, like=like if like.is_cuda else None)
     loss = batch.problem.loss_of(terms)

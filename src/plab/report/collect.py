@@ -105,7 +105,13 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     found, unreadable = rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
-    asked = _asked(fitting, chosen)
+    free = {
+        "task": suite_tasks(),
+        "variant": list(SUITE_VARIANTS),
+        "method": ordered(row.values["method"] for row in fitting),
+        "seed": sorted({str(row.values["seed"]) for row in fitting} | set(PAPER_SEEDS), key=int),
+    }
+    asked = {name: chosen.choices.get(name, free[name]) for name in NAMES}
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
     methods, seeds = asked["method"], asked["seed"]
@@ -139,17 +145,6 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         left_out=[*left_out, *(f"left out: {error}" for error in unreadable)],
         configs=[row.config for row in finished],
     )
-
-
-def _asked(found: Sequence[Row], chosen: Selection) -> dict[str, list[str]]:
-    seeds = {str(row.values["seed"]) for row in found} | set(PAPER_SEEDS)
-    free = {
-        "task": suite_tasks(),
-        "variant": list(SUITE_VARIANTS),
-        "method": ordered(row.values["method"] for row in found),
-        "seed": sorted(seeds, key=int),
-    }
-    return {name: chosen.choices.get(name, free[name]) for name in NAMES}
 
 
 def _split(

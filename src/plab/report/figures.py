@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -126,21 +126,26 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         *settings_note(runs),
     ]
 
-    def draw(panel: Axes, task: str) -> None:
-        _rewards(panel, runs, _pick(series, task=task))
-
     tasks = _tasks_with_runs(runs)
-    figure, axes = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
-    for panel, (task, variant) in zip(axes.flat, itertools.product(tasks, runs.variants), strict=True):
-        panel.set_title(f"{task}-v{variant}")
-        _rewards(panel, runs, _pick(series, task=task, variant=variant))
-    figure.supxlabel("episodes", fontsize=8)
-    figure.supylabel("reward", fontsize=8)
-    legend(figure)
-    return [
-        Drawing("reward_per_task", _per_task(runs, draw, "episodes", "reward"), notes),
-        Drawing("reward_per_configuration", figure, notes),
-    ]
+    columns = min(len(tasks), 5)
+    # Panels are larger if there are few.
+    few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
+    figures = {
+        "reward_per_task": grid(-(-len(tasks) // columns), columns, **few),
+        "reward_per_configuration": grid(len(tasks), len(runs.variants), width=1.6, height=1.25),
+    }
+    names: list[list[tuple[str, ...]]] = [[(task,) for task in tasks]]
+    names.append(list(itertools.product(tasks, runs.variants)))
+    for (figure, axes), shown in zip(figures.values(), names, strict=True):
+        for panel in axes.flat[len(shown) :]:
+            panel.set_visible(False)
+        for panel, own in zip(axes.flat, shown, strict=False):
+            panel.set_title("-v".join(own))
+            _rewards(panel, runs, _pick(series, **dict(zip(("task", "variant"), own, strict=False))))
+        figure.supxlabel("episodes", fontsize=8)
+        figure.supylabel("reward", fontsize=8)
+        legend(figure)
+    return [Drawing(name, figure, notes) for name, (figure, _) in figures.items()]
 
 
 def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
@@ -160,23 +165,6 @@ def _rewards(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]]) -> None:
             panel.plot(one.x, one.mean, color=look.colour, linestyle=look.dashes, label=look.label)
             panel.fill_between(one.x, low, one.mean + one.std, color=look.colour, alpha=0.18, linewidth=0)
     panel.set(ylim=(0.0, None), xscale="log" if tables else "linear")
-
-
-def _per_task(runs: Runs, draw: Callable[[Axes, str], None], across: str, up: str) -> Figure:
-    """Return a figure with one panel per task with runs, five per row; panels are larger if there are few."""
-    tasks = _tasks_with_runs(runs)
-    columns = min(len(tasks), 5)
-    few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
-    figure, axes = grid(-(-len(tasks) // columns), columns, **few)
-    for panel in axes.flat[len(tasks) :]:
-        panel.set_visible(False)
-    for panel, task in zip(axes.flat, tasks, strict=False):
-        draw(panel, task)
-        panel.set_title(task)
-    figure.supxlabel(across, fontsize=8)
-    figure.supylabel(up, fontsize=8)
-    legend(figure)
-    return figure
 
 
 def _tasks_with_runs(runs: Runs) -> list[str]:
