@@ -95,15 +95,13 @@ def main(argv: Sequence[str]) -> None:
     rows = []
     for task, own in tasks.items():
         name = options.name or f"plab/{task}-v0"
-        recorder = _Recorder(own, observe, cameras, options.together)
-        episodes = (one for one in recorder.play() if one.attributes["score"] >= options.min_score)
-        about = {
-            "algorithm_name": ", ".join(sorted({one.source for one in own})),
-            "code_permalink": "",
-            "author": ["plab"],
-            "author_email": [],
-        }
-        kept = write_dataset(output, name, episodes, recorder.spaces, recorder.env_spec(), about)
+        cfgs = [one.cfg for one in own]
+        batch = EpisodeBatch(cfgs[: options.together], observe=observe, cameras=cameras)
+        episodes = (one for one in _episodes(own, batch) if one.attributes["score"] >= options.min_score)
+        sources = ", ".join(sorted({one.source for one in own}))
+        about = {"algorithm_name": sources, "code_permalink": "", "author": ["plab"], "author_email": []}
+        spec = _env_spec(cfgs[0], observe, cameras)
+        kept = write_dataset(output, name, episodes, _spaces(own, batch, observe), spec, about)
         scores = [one["score"] for one in kept]
         rows.append([output / name, len(kept), len(own) - len(kept), np.mean(scores), min(scores)])
     print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows)
@@ -188,43 +186,24 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
 # -------------------------------------------------------------------------------------------------- episodes
 
 
-class _Recorder:
-    """Batched replay of one task's demonstrations.
+def _spaces(
+    demonstrations: Sequence[Demonstration], batch: EpisodeBatch, observe: str | list[str]
+) -> tuple[Space[Any], Space[Any]]:
+    """Return the spaces of observations and actions, which cover all scenes."""
+    cfgs = [one.cfg for one in demonstrations]
+    state, actions = spaces(cfgs[0], build_scenes(cfgs))
+    seen: Space[Any] = batch.observation_space
+    if isinstance(seen, Dict) and "state" in seen.spaces:
+        return Dict({**seen.spaces, "state": state}), actions
+    return state if observe == "state" else seen, actions
 
-    Attributes:
-        spaces: Spaces of observations and actions, covering all scenes.
-    """
 
-    def __init__(
-        self,
-        demonstrations: Sequence[Demonstration],
-        observe: str | list[str],
-        cameras: Mapping[str, Camera] | None,
-        together: int,
-    ) -> None:
-        """Build the environments."""
-        self._all, self._observe, self._cameras = demonstrations, observe, cameras
-        cfgs = [one.cfg for one in demonstrations]
-        self._batch = EpisodeBatch(cfgs[:together], observe=observe, cameras=cameras)
-        state, actions = spaces(cfgs[0], build_scenes(cfgs))
-        seen: Space[Any] = self._batch.observation_space
-        if observe == "state":
-            seen = state
-        elif isinstance(seen, Dict) and "state" in seen.spaces:
-            seen = Dict({**seen.spaces, "state": state})
-        self.spaces = seen, actions
-
-    def play(self) -> Iterator[Episode]:
-        """Yield the episodes that do not diverge."""
-        size = self._batch.size
-        for first in range(0, len(self._all), size):
-            part = self._all[first : first + size]
-            filled = [part[k % len(part)] for k in range(size)]
-            self._batch.renew([one.cfg for one in filled])
-            yield from self._episodes(part, filled)
-
-    def _episodes(self, part: Sequence[Demonstration], filled: Sequence[Demonstration]) -> Iterator[Episode]:
-        batch = self._batch
+def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> Iterator[Episode]:
+    """Replay demonstrations of one task, and yield the episodes that do not diverge."""
+    for first in range(0, len(demonstrations), batch.size):
+        part = demonstrations[first : first + batch.size]
+        filled = [part[k % len(part)] for k in range(batch.size)]
+        batch.renew([one.cfg for one in filled])
         observation, info = batch.reset()
         seen, infos, rewards, failures = [observation], [info], [], dict[int, str]()
         actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
@@ -252,22 +231,21 @@ class _Recorder:
                 attributes=named | {"score": float(measured["score"][-1])},
             )
 
-    def env_spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """Return the environment specification of the first episode, for minari's ``recover_environment``."""
-        cfg = self._all[0].cfg
-        words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
-        words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
-        words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
-        kwargs: dict[str, Any] = {
-            "task": cfg.task.name,
-            "variant": cfg.variant if cfg.seed_scene is None else "random",
-            "overrides": words,
-            "observe": self._observe,
-        }
-        if cfg.task.randomize:
-            kwargs["randomize"] = cfg.task.randomize
-        if self._cameras is not None:
-            kwargs["cameras"] = {name: asdict(camera) for name, camera in self._cameras.items()}
-        return gymnasium.envs.registration.EnvSpec(
-            id=f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs
-        )
+
+def _env_spec(
+    cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None
+) -> gymnasium.envs.registration.EnvSpec:
+    """Return the specification of an environment, for minari's ``recover_environment``."""
+    words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
+    words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
+    words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
+    variant = cfg.variant if cfg.seed_scene is None else "random"
+    kwargs: dict[str, Any] = {"task": cfg.task.name, "variant": variant, "overrides": words}
+    kwargs["observe"] = observe
+    if cfg.task.randomize:
+        kwargs["randomize"] = cfg.task.randomize
+    if cameras is not None:
+        kwargs["cameras"] = {name: asdict(camera) for name, camera in cameras.items()}
+    return gymnasium.envs.registration.EnvSpec(
+        id=f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs
+    )

@@ -9,6 +9,7 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -35,7 +36,11 @@ def main(argv: Sequence[str]) -> int:
         return 0
     check_overrides(words, config_dir)
     if options.cfg:
-        _print_configuration(options, words)
+        config = compose_with_hydra(words, config_dir)
+        shown = {name: config[name] for name in config if (name == "hydra") == (options.cfg == "hydra")}
+        whole: Any = OmegaConf.create(shown, flags={"allow_objects": True})
+        whole = OmegaConf.select(whole, options.package) if options.package else whole
+        print(OmegaConf.to_yaml(whole).rstrip())
         return 0
     try:
         if (master := _sweep_settings(options, words)) is not None:
@@ -80,13 +85,6 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     if idle := [word for word in words if _OF_SWEEPS.match(word)]:
         raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or omit it")
     return None
-
-
-def _print_configuration(options: Namespace, words: Sequence[str]) -> None:
-    config = compose_with_hydra(words, options.config_dir)
-    shown = {name: config[name] for name in config if (name == "hydra") == (options.cfg == "hydra")}
-    whole = OmegaConf.create(shown, flags={"allow_objects": True})
-    print(OmegaConf.to_yaml(OmegaConf.select(whole, options.package) if options.package else whole).rstrip())
 
 
 def parser() -> Parser:

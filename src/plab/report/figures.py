@@ -126,7 +126,7 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         *settings_note(runs),
     ]
 
-    tasks = _tasks_with_runs(runs)
+    tasks = [task for task in ordered_tasks(runs.tasks) if task in set(runs.table["task"])]
     columns = min(len(tasks), 5)
     # Panels are larger if there are few.
     few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
@@ -165,10 +165,6 @@ def _rewards(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]]) -> None:
             panel.plot(one.x, one.mean, color=look.colour, linestyle=look.dashes, label=look.label)
             panel.fill_between(one.x, low, one.mean + one.std, color=look.colour, alpha=0.18, linewidth=0)
     panel.set(ylim=(0.0, None), xscale="log" if tables else "linear")
-
-
-def _tasks_with_runs(runs: Runs) -> list[str]:
-    return [task for task in ordered_tasks(runs.tasks) if task in set(runs.table["task"])]
 
 
 # ----------------------------------------------------------------------------------------------- final scores

@@ -257,7 +257,11 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
         if _final(path) in files:
             del files[path]
     place = _index_place(root)
-    known, now = _stored(place) if index else {}, time.time()
+    known: Index = {}
+    # Missing or damaged, the index is built again.
+    with suppress(OSError, EOFError, ValueError, zlib.error):
+        known = dict(json.loads(gzip.decompress(place.read_bytes()))) if index else {}
+    now = time.time()
     kept: Index = {}
     for path, status in files.items():
         name = os.path.relpath(path, root)
@@ -348,13 +352,6 @@ def _index_place(root: Path) -> Path:
         return root / _INDEX
     digest = hashlib.sha256(os.fsencode(root.resolve())).hexdigest()[:16]
     return cache_dir() / "results" / f"{digest}{_INDEX}"
-
-
-def _stored(place: Path) -> Index:
-    """Return the index; empty if it is missing or damaged."""
-    with suppress(OSError, EOFError, ValueError, zlib.error):
-        return dict(json.loads(gzip.decompress(place.read_bytes())))
-    return {}
 
 
 # -------------------------------------------------------------------------------------------------------- SQL

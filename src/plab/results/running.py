@@ -228,7 +228,10 @@ class RunFile:
             except NewerSchemaError:
                 raise
             except ResultsError as error:
-                _move_aside(path, error)
+                names = (f"{path.name}.bad{number or ''}" for number in itertools.count())
+                aside = next(one for name in names if not (one := path.with_name(name)).exists())
+                os.replace(path, aside)
+                _log.warning("%s; moved to %s, starting afresh", error, aside.name)
                 continue
             if earlier.resume is None:
                 continue
@@ -258,13 +261,6 @@ def _extended(
         before = columns.get(name, np.full(known, math.nan))
         extended[name] = np.concatenate([before, added]) if known else added
     return extended
-
-
-def _move_aside(path: Path, reason: ResultsError) -> None:
-    names = (f"{path.name}.bad{number or ''}" for number in itertools.count())
-    aside = next(aside for name in names if not (aside := path.with_name(name)).exists())
-    os.replace(path, aside)
-    _log.warning("%s; moved to %s, starting afresh", reason, aside.name)
 
 
 # ------------------------------------------------------------------------------------------------------ locks
