@@ -149,11 +149,6 @@ class Transition:
     failures: Mapping[int, str] = field(default_factory=dict)
 
     @property
-    def over(self) -> np.ndarray:
-        """Mask of the episodes that have ended for any reason, shape [batch]."""
-        return self.terminated | self.cut_off
-
-    @property
     def cut_off(self) -> np.ndarray:
         """Mask of the episodes that have reached the horizon or diverged, shape [batch]."""
         broken = np.zeros_like(self.truncated)
@@ -562,29 +557,12 @@ class EpisodeBatch:
         like: torch.Tensor | None = None,
     ) -> Array:
         """Advance all sub-environments by some steps with actions chosen from observations, and backpropagate
-        through the states and the policy.
-
-        Observations are float64; CUDA tensors have the type of ``like``.
-
-        Args:
-            steps: Number of steps T, at most the remaining steps of the episodes.
-            choose: Policy, called with t = 0 to T and observations, shape [batch, entry]. Returns the actions
-                of step t, shape [batch, action]; the result for T is ignored.
-            react: Pullback of the policy, called with t = T to 0 and the derivative of the discounted loss
-                with respect to the actions of step t, None for T. Returns the derivative with respect to the
-                observation before step t through these actions (for T: of a function of the last
-                observation), or None.
-            discount: Discount factor: the loss of step t is weighted by ``discount ** t``.
-            like: If a CUDA tensor, all arrays are CUDA tensors.
-
-        Returns:
-            Unweighted loss terms after each step, shape [batch, T, term].
+        through the states and the policy: :meth:`plab.sim.Simulator.closed_loop` with observations, shape
+        [batch, entry], float64 or of the type of ``like``, in place of states.
 
         Raises:
-            ValueError: If an action has another shape or is not finite.
-            gymnasium.error.ResetNeeded: If the episodes have fewer steps left.
-            plab.sim.SimulationError: If a state, loss or gradient stops being finite.
-            MemoryError: If the gradient does not fit the memory budget.
+            gymnasium.error.ResetNeeded: If the episodes have fewer steps left; other errors are those of the
+                simulator.
         """
         taken = self._taken(steps)
 

@@ -106,7 +106,7 @@ class PlabVecEnv(VecEnv):
             self.batch.require_running()
         done = self.batch.step(self._actions, strict=False)
         observation, infos = done.observation, self._split(done.info, done.failures)
-        over = done.truncated if self.together else done.over
+        over = done.truncated if self.together else done.terminated | done.cut_off
         for number, info in enumerate(infos):
             info["TimeLimit.truncated"] = bool(over[number] and not done.terminated[number])
             if over[number]:

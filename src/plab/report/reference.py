@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import io
 from dataclasses import dataclass
@@ -18,12 +17,6 @@ PAPER_SEED_COUNT = len(PAPER_SEEDS)
 """Number of runs per configuration in the paper."""
 
 
-@functools.cache
-def _read(name: str) -> pd.DataFrame:
-    with (files("plab.report") / "paper" / f"{name}.csv").open(encoding="utf-8") as file:
-        return pd.read_csv(file, comment="#", dtype={"variant": str})
-
-
 def paper_table(name: str) -> pd.DataFrame:
     """Return one of the paper's tables.
 
@@ -32,7 +25,8 @@ def paper_table(name: str) -> pd.DataFrame:
             (the same without variant), ``timing`` (task, forward_ms, forward_backward_ms) or
             ``settings`` (method, key, value). Standard deviations are of the population.
     """
-    return _read(name).copy()
+    with (files("plab.report") / "paper" / f"{name}.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file, comment="#", dtype={"variant": str})
 
 
 @dataclass(frozen=True)
