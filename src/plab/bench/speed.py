@@ -41,9 +41,7 @@ QUICK_KINDS = (FORWARD, GRADIENT)
 PAPER_KINDS = (REWARD, GRADIENT)
 
 
-def rows(
-    cfg: Config, batch: int, steps: int, repeats: int, kinds: Sequence[str]
-) -> Iterator[dict[str, object]]:
+def rows(cfg: Config, batch: int, steps: int, repeats: int, kinds: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Measure one configuration and batch size.
 
     Args:
@@ -90,16 +88,13 @@ def rows(
 def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, object]:
     """Return the milliseconds per environment step of one environment of a task, next to the paper's."""
     paper = paper_table("timing").set_index("task").loc[cfg.task.name]
-    found: dict[Any, Any] = {row["what"]: row for row in rows(cfg, batch, steps, repeats, PAPER_KINDS)}
-    out: dict[str, object] = {
-        "task": cfg.task.name,
-        "device": cfg.sim.device,
-        "precision": cfg.sim.precision,
-        "batch": batch,
-    }
+    measured = rows(cfg, batch, steps, repeats, PAPER_KINDS)
+    found = {row["what"]: row["median_ms"] / batch for row in measured}
+    out: dict[str, object] = {"task": cfg.task.name, "device": cfg.sim.device}
+    out |= {"precision": cfg.sim.precision, "batch": batch}
     columns = (("forward", REWARD, "forward_ms"), ("gradient", GRADIENT, "forward_backward_ms"))
     for name, kind, printed in columns:
-        ms = found[kind]["median_ms"] / batch if kind in found else math.nan
+        ms = found.get(kind, math.nan)
         out |= {f"{name}_ms": round(ms, 2), f"{name}_paper_ms": float(paper[printed])}
     return out
 

@@ -70,14 +70,9 @@ def _frames(recording: RecordedRollout, every: int) -> Iterator[tuple[int, dict[
         for step in sorted({*range(0, last, every), last}):
             poses = recording.poses[step]
             rigid = [p.mesh.transform(pose_matrix(poses[k], p.side), inplace=False) for k, p in parts]
-            clay = enumerate(body_meshes(scene, recording.x[step]))
-            yield (
-                step,
-                {
-                    "plasticine": _merged(clay, "body"),
-                    "manipulators": _merged(zip([k for k, _ in parts], rigid, strict=True), "manipulator"),
-                },
-            )
+            clay = _merged(enumerate(body_meshes(scene, recording.x[step])), "body")
+            tools = _merged(zip([k for k, _ in parts], rigid, strict=True), "manipulator")
+            yield step, {"plasticine": clay, "manipulators": tools}
             report(step, "")
 
 

@@ -52,11 +52,19 @@ def execute(
         what = f"{', '.join(missing)}, not installed here: pip install 'plab[report]'"
         raise ResultsError(f"notebooks need {what}")
     import nbformat
+    from nbconvert import HTMLExporter
 
-    pages = []
+    pages, style = [], asset("page.css") + asset("notebook.css")
     for number, name in enumerate(names, start=1):
         notebook = _executed(name, parameters)
-        files = {"ipynb": nbformat.writes(notebook), "html": _page(notebook, name, names)}
+        exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
+        values: dict[str, Any] = {
+            "body": exporter.from_notebook_node(notebook)[0],
+            "name": name,
+            "names": names,
+        }
+        html = render("notebook.html", style=style, script=asset("theme.js"), **values)
+        files = {"ipynb": nbformat.writes(notebook), "html": html}
         for suffix, text in files.items():
             replace_file(out / f"{name}.{suffix}", text)
         pages.append(out / f"{name}.html")
@@ -85,12 +93,3 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
             # Results are displayed explicitly; printed text comes from libraries.
             cell.outputs = [output for output in cell.outputs if output.output_type != "stream"]
     return notebook
-
-
-def _page(notebook: Any, name: str, names: Sequence[str]) -> str:
-    from nbconvert import HTMLExporter
-
-    exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
-    body, _ = exporter.from_notebook_node(notebook)
-    style = asset("page.css") + asset("notebook.css")
-    return render("notebook.html", style=style, script=asset("theme.js"), body=body, name=name, names=names)

@@ -73,8 +73,10 @@ class RunFile:
         self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
-        earlier = None if config["force"] else self._finished_earlier()
-        if earlier is not None:
+        # Number of iterations of earlier processes.
+        self._known = 0
+        earlier = self._finished_earlier()
+        if earlier is not None and not config["force"]:
             self._state = earlier, ()
             # Left by a process that was killed just after finishing; a locked run is being recomputed.
             with suppress(OSError):
@@ -85,30 +87,26 @@ class RunFile:
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock_and_resume(config["force"])
-        except OSError as error:
+            # Files are read under the lock, because its last holder may have changed them.
+            self._lock = acquire(self.path)
+            if self._lock is None:
+                raise RunBusyError(f"{self.path} is being computed by another process")
+            # With force the replay buffer of a partial file will be replaced.
+            self._remove(*([PARTIAL_SUFFIX] if config["force"] else []))
+            if not config["force"]:
+                self._take_up_earlier()
+            self._known = self._state[0].rows
+            if self.finished:
+                self.release()
+            elif not self.partial_path.exists():
+                # A run in progress has a file from the start, for plab status and to detect a full disk.
+                write(self.result, self.partial_path)
+        except BaseException as error:
             self._release_empty_folders()
-            why = error.strerror or error
-            raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
-        except BaseException:
-            self._release_empty_folders()
+            if isinstance(error, OSError):
+                why = error.strerror or error
+                raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
             raise
-
-    def _lock_and_resume(self, force: bool) -> None:
-        # Files are read under the lock, because its last holder may have changed them.
-        self._lock = acquire(self.path)
-        if self._lock is None:
-            raise RunBusyError(f"{self.path} is being computed by another process")
-        # With force the replay buffer of a partial file will be replaced.
-        self._remove(*([PARTIAL_SUFFIX] if force else []))
-        if not force:
-            self._take_up_earlier()
-        if self.finished:
-            self.release()
-            return
-        if not self.partial_path.exists():
-            # A run in progress has a file from the start, for plab status and to detect a full disk.
-            write(self.result, self.partial_path)
 
     def _remove(self, *suffixes: str) -> None:
         """Remove temporary files of the run, and files with the given suffixes."""
@@ -143,6 +141,11 @@ class RunFile:
     def finished(self) -> bool:
         """True if this process or an earlier one has completed the run."""
         return self._state[0].status == "finished"
+
+    @property
+    def advanced(self) -> bool:
+        """True if this process has computed an iteration of the run."""
+        return self.result.rows > self._known
 
     def release(self) -> None:
         """Release the run's lock for other processes; nothing may be written afterwards."""

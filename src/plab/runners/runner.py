@@ -115,8 +115,7 @@ class Track:
         self.finished_before, self.log = run.finished, RunLog(cfg, run)
         result = run.result
         columns, rows = result.columns, result.rows
-        self.iteration = self._first = rows
-        self.best_loss, self.best_actions = result.best_loss, result.best_actions
+        self.iteration, self.best_loss, self.best_actions = rows, result.best_loss, result.best_actions
         own = family(cfg.method.family)
         self.contact = own.contact or cfg.method.contact
         self._by_score = own.ranking == "score"
@@ -148,7 +147,7 @@ class Track:
         """Mark the run as failed because of an error, or a reason in the current iteration. Its file keeps
         the results so far; a run that is rejected before its first iteration leaves no file."""
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
-        if isinstance(error, ResultsError) or (_is_refusal(error) and self.iteration == self._first):
+        if isinstance(error, ResultsError) or (_is_refusal(error) and not self.run.advanced):
             # After a ResultsError nothing can be written to the file.
             self.run.discard()
         else:
