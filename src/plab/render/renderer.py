@@ -64,8 +64,6 @@ class Renderer:
             size: Width and height of the pictures [pixels].
             camera: Camera; default: :func:`plab.render.camera.scene_camera`.
         """
-        if len(size) != 2 or min(size) < 1:
-            raise ArgumentError(f"size must be width and height in pixels (got {size})")
         self.size, self._scene = size, scene
         self.camera = camera or scene_camera(scene, target_mass, size)
         self._parts = [manipulator_parts(manipulator) for manipulator in scene.manipulators]
