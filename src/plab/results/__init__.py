@@ -13,12 +13,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from plab.config.run import config_dict, config_hash
-from plab.config.selection import lookup
 from plab.results.run_file import (
     BUDGETS,
     SCHEMA_VERSION,
-    STATUSES,
-    NewerSchemaError,
     ResultsError,
     RunBusyError,
     RunResult,
@@ -34,8 +31,6 @@ if TYPE_CHECKING:
 __all__ = [
     "BUDGETS",
     "SCHEMA_VERSION",
-    "STATUSES",
-    "NewerSchemaError",
     "ResultsError",
     "Row",
     "RunBusyError",
@@ -46,7 +41,6 @@ __all__ = [
     "config_hash",
     "connect",
     "load",
-    "lookup",
     "pack",
     "read",
     "read_curves",
