@@ -393,8 +393,9 @@ class EpisodeBatch:
             for e, seed in zip(rows, seeds, strict=True):
                 self._seeds[e], self._episodes[e] = (int(seed),), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
-        entropy = [(*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)]
-        changed = self.randomizer.randomize_episodes(rows, entropy, options or {})
+        entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
+        drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}
+        changed = self.randomizer.put(drawn)
         if self._stages:
             changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers

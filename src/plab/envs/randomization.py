@@ -130,24 +130,9 @@ class EpisodeRandomizer:
                 known[e] = base.target_observation
         return known
 
-    def randomize_episodes(
-        self, environments: Sequence[int], seeds: Sequence[Sequence[int]], given: Mapping[str, Any]
-    ) -> bool:
-        """Sample the next episodes of some sub-environments, and update the simulator's scenes and targets.
-
-        Args:
-            environments: Numbers of the sub-environments.
-            seeds: Entropy of each sub-environment.
-            given: Values by dotted key that replace samples, for all or one per sub-environment of the batch;
-                ValueError if a key is unknown, or a scene cannot be simulated with a value.
-
-        Returns:
-            Whether anything differs from the previous episodes.
-        """
-        return self.put({e: self._drawn(e, seed, given) for e, seed in zip(environments, seeds, strict=True)})
-
     def put(self, values: Mapping[int, Values]) -> bool:
-        """Apply values to some sub-environments; return whether any values were given."""
+        """Apply values to some sub-environments, in the simulator's scenes and targets; return whether
+        anything differs from the previous episodes."""
         values = {e: own for e, own in values.items() if own != self.values[e]}
         if not values:
             return False
@@ -169,7 +154,9 @@ class EpisodeRandomizer:
         problem.set_episode_starts(scenes, particles, targets)
         return True
 
-    def _drawn(self, e: int, seed: Sequence[int], given: Mapping[str, Any]) -> Values:
+    def sample(self, e: int, seed: Sequence[int], given: Mapping[str, Any]) -> Values:
+        """Sample the next episode of a sub-environment from its entropy. Values by dotted key in ``given``
+        replace samples, for all or one per sub-environment; raise ValueError if a key is unknown."""
         cfg = self._cfgs[e]
         pool = self._pools.get(id(cfg), ())
         if not (cfg.task.randomize or given):
