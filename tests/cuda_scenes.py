@@ -19,12 +19,7 @@ STEPS = 3
 
 
 def simulator_of(
-    scenes: Sequence[int],
-    precision: str,
-    contact: str,
-    *,
-    device: str = "cuda",
-    deterministic: bool = True,
+    scenes: Sequence[int], precision: str, contact: str, *, device: str = "cuda", deterministic: bool = True
 ) -> Simulator:
     """Simulator of scenes partly strained beyond the range of the series; ``contact`` is a loss term."""
     terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0}, {"contact": contact})

@@ -20,12 +20,7 @@ from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
 from plab.runners import RunError, Step, Track, planner, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
-from plab.runners.planner import (
-    Answer,
-    CandidateStart,
-    Request,
-    make_planner,
-)
+from plab.runners.planner import Answer, CandidateStart, Request, make_planner
 from plab.runners.runner import SimulatorCache
 from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
@@ -221,12 +216,7 @@ def test_costs_and_curves() -> None:
 
 STEPS = 4
 
-COARSE = (
-    "task=Move",
-    *COARSE_32,
-    f"sim.horizon={STEPS}",
-    "progress=false",
-)
+COARSE = ("task=Move", *COARSE_32, f"sim.horizon={STEPS}", "progress=false")
 
 SAMPLER = ("method.population=4", "method.iterations=4", "method.spread=0.4")
 METHODS: dict[str, tuple[str, ...]] = {

@@ -13,15 +13,7 @@ import pytest
 
 import synthetic
 from plab.config.run import member_name
-from plab.results import (
-    ResultsError,
-    RunFile,
-    RunResult,
-    config_hash,
-    load,
-    read,
-    write,
-)
+from plab.results import ResultsError, RunFile, RunResult, config_hash, load, read, write
 from plab.results.run_file import COLUMNS, last_score
 
 

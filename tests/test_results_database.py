@@ -200,10 +200,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 
 def test_sql_refuses_in_a_line(folder: Path, told) -> None:
     load(folder)
-    for sql, named in (
-        ("select lr from runs", "lr"),
-        ("select * from scores", "iterations"),
-    ):
+    for sql, named in (("select lr from runs", "lr"), ("select * from scores", "iterations")):
         assert named in told(["sql", sql, str(folder)], main)
 
 

@@ -22,15 +22,7 @@ from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.submissions import record
 from plab.submissions.submission import UNSEEN, SubmissionError, read, write
-from plab.submissions.verifying import (
-    BROKE_OFF,
-    HOLDS,
-    LIES,
-    NOT_RUN,
-    load_policy,
-    play,
-    read_verification,
-)
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, load_policy, play, read_verification
 from toy_runner import COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -234,10 +226,7 @@ def test_policies_answer_alike_in_both_formats(tmp_path: Path) -> None:
 
 
 def test_a_policy_is_run_only_if_asked(
-    tmp_path: Path,
-    env: gymnasium.Env,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, env: gymnasium.Env, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Of five variants and ten unseen ones.
     monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -13,12 +14,15 @@ from typing import Any
 
 import pytest
 
+import plab
 import synthetic
 from plab.config import Config, load_config
+from plab.objective import target_sdf
 from plab.results import RunResult, load, read
 from plab.runners import run_config
 from plab.scenes import Scene
 from plab.sim import Simulator
+from plab.targets import build_target
 from same_runs import shared_simulator, stopped_at
 from toy_runner import COARSE, COARSE_32
 
@@ -27,6 +31,7 @@ DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
+LOSS = ROOT / "examples" / "own_loss"
 
 # Run in a copy of plab that has the disc: gradients must be what differences are.
 DISC = """
@@ -117,6 +122,30 @@ def test_environments():
     assert run_page("datasets.md", ("datasets/plab/Move-v0", "example"))["episode"].rewards.size == 50
 
 
+@pytest.mark.usefixtures("small")
+def test_a_policy_and_the_state_that_it_reaches():
+    """Train on Torus for two episodes; load the policy, and make the final state the target."""
+    words = ["task=Torus", "method=ppo", "method.episodes=2", "method.num_envs=2", "method.hidden=[8]"]
+    words += ["method.steps_per_update=100", "method.minibatches=2", "method.epochs=1"]
+    cfg = load_config([*words, *COARSE_32, "progress=false"])
+    run_config(cfg)
+    names = run_page("rl.md", ("results/Torus-v1/ppo/seed0-12ab34cd.h5", str(cfg.path)))
+    assert names["dones"].all() and names["rewards"].shape == (4,)
+    result = read(cfg.path)
+    reached = result.iterations["score"].iloc[-1]
+    assert [info["score"] for info in names["infos"]] == pytest.approx([reached] * 4, abs=1e-6)
+    run_page("own_shapes.md")
+    with contextlib.closing(plab.make("Torus")) as env:
+        problem = env.unwrapped.batch.problem
+        mass = build_target(problem.scenes[0], {"recipe": "mass", "file": "mass.npy"})
+        problem.simulator.set_target(mass[None], target_sdf(mass)[None])
+        # The final state is near the initial one, which magnifies rounding.
+        assert env.reset()[1]["score"] == pytest.approx(0.0, abs=1e-3)
+        for action in result.best_actions:
+            info = env.step(action)[4]
+        assert info["score"] == pytest.approx(1.0, abs=1e-3)
+
+
 def test_results(monkeypatch, tmp_path):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.chdir(tmp_path)
@@ -135,11 +164,12 @@ def test_rendering():
     assert names["picture"].shape == (360, 480, 3)
 
 
-@pytest.mark.parametrize("excerpt", [*blocks("own_method.md", "python"), *blocks("own_method.md", "yaml")])
-def test_excerpts_are_from_the_methods(excerpt):
-    files = [path for folder in (METHOD, RL) for path in folder.rglob("*.*")]
-    sources = [file for file in files if file.suffix in (".py", ".yaml")]
-    assert any(excerpt in file.read_text(encoding="utf-8") for file in sources)
+@pytest.mark.parametrize("page", ["own_method.md", "losses.md"])
+def test_excerpts_are_from_the_examples(page):
+    files = [path for folder in (METHOD, RL, LOSS) for path in folder.rglob("*.*")]
+    sources = [file.read_text(encoding="utf-8") for file in files if file.suffix in (".py", ".yaml")]
+    for excerpt in (*blocks(page, "python"), *blocks(page, "yaml")):
+        assert any(excerpt in source for source in sources), excerpt
 
 
 def python(folder: Path, *words: str, path: Path = SRC) -> subprocess.CompletedProcess[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import threading
 
@@ -10,6 +9,7 @@ import gymnasium.wrappers as single
 import gymnasium.wrappers.vector as many
 import numpy as np
 import pytest
+import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import data_equivalence
@@ -45,6 +45,16 @@ def vector(request):
     env = plab.make_vec("Move", num_envs=2, overrides=COARSE, autoreset_mode=request.param.value)
     yield env
     env.close()
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """An environment and a vector environment whose observations are pictures."""
+    how = {"overrides": COARSE, "observe": "rgb", "render_mode": "rgb_array", "render_size": (64, 48)}
+    envs = plab.make("Move", **how), plab.make_vec("Move", num_envs=2, **how)
+    yield envs
+    for env in envs:
+        env.close()
 
 
 def test_every_autoreset_mode_is_that_of_gymnasium(vector, alone) -> None:
@@ -162,74 +172,48 @@ def test_goals_agree_with_hindsight() -> None:
     env.close()
 
 
-def test_wrappers_of_environments(alone) -> None:
-    env, picture = alone[0], plab.make("Move", overrides=COARSE, **PICTURES)
-    drawn = plab.make("Move", overrides=COARSE, render_mode="rgb_array")
-    colours, size = plab.make("Move", overrides=COARSE, observe="rgb"), env.observation_space.shape[0]
-    wrapped = [
-        single.AddWhiteNoise(colours, 0.1),
-        single.GrayscaleObservation(colours),
-        single.ObstructView(colours, 0.1, 5),
-        single.OrderEnforcing(env.unwrapped),
-        single.PassiveEnvChecker(env.unwrapped),
-        single.DiscretizeAction(env, 3),
-        single.RepeatAction(env, 2),
-        single.DelayObservation(env, 1),
-        single.DtypeObservation(env, np.float64),
-        single.FrameStackObservation(env, 2),
-        single.NormalizeObservation(env),
-        single.RescaleObservation(env, np.float32(-1), np.float32(1)),
-        single.ReshapeObservation(env, (2, size // 2)),
-        single.TimeAwareObservation(env),
-        single.TransformObservation(env, np.copy, env.observation_space),
-        single.MaxAndSkipObservation(env, 2),
-        single.FlattenObservation(picture),
-        single.FilterObservation(picture, ["front_depth"]),
-        single.AddRenderObservation(drawn, render_only=False),
-        single.RenderCollection(drawn),
-        single.ClipAction(env),
-        single.RescaleAction(env, -2.0, 2.0),
-        single.StickyAction(env, 0.5),
-        single.TransformAction(env, np.copy, WIDE),
-        single.ClipReward(env, -1.0, 1.0),
-        single.NormalizeReward(env),
-        single.TransformReward(env, abs),
-        single.RecordEpisodeStatistics(env),
-        single.TimeLimit(env, HORIZON),
-        single.Autoreset(env),
-    ]
+def test_wrappers_of_environments(alone, pictured) -> None:
+    env, picture, colours = alone[0], plab.make("Move", overrides=COARSE, **PICTURES), pictured[0]
+    size = env.observation_space.shape[0]
+    wrapped = [single.AddWhiteNoise(colours, 0.1), single.GrayscaleObservation(colours)]
+    wrapped += [single.ObstructView(colours, 0.1, 5), single.OrderEnforcing(env.unwrapped)]
+    wrapped += [single.PassiveEnvChecker(env.unwrapped), single.DiscretizeAction(env, 3)]
+    wrapped += [single.RepeatAction(env, 2), single.DelayObservation(env, 1)]
+    wrapped += [single.DiscretizeObservation(env, 5, multidiscrete=True)]
+    wrapped += [single.DtypeObservation(env, np.float64), single.FrameStackObservation(env, 2)]
+    wrapped += [single.NormalizeObservation(env)]
+    wrapped += [single.RescaleObservation(env, np.float32(-1), np.float32(1))]
+    wrapped += [single.ReshapeObservation(env, (2, size // 2)), single.TimeAwareObservation(env)]
+    wrapped += [single.TransformObservation(env, np.copy, env.observation_space)]
+    wrapped += [single.MaxAndSkipObservation(env, 2), single.FlattenObservation(picture)]
+    wrapped += [single.FilterObservation(picture, ["front_depth"])]
+    wrapped += [single.AddRenderObservation(colours, render_only=False), single.RenderCollection(colours)]
+    wrapped += [single.ClipAction(env), single.RescaleAction(env, -2.0, 2.0), single.StickyAction(env, 0.5)]
+    wrapped += [single.TransformAction(env, np.copy, WIDE), single.ClipReward(env, -1.0, 1.0)]
+    wrapped += [single.NormalizeReward(env), single.TransformReward(env, abs)]
+    wrapped += [single.RecordEpisodeStatistics(env), single.TimeLimit(env, HORIZON), single.Autoreset(env)]
     for one in wrapped:
         observation, _ = one.reset(seed=0)
         assert one.observation_space.contains(observation), one
         while not (result := one.step(one.action_space.sample()))[3]:
             assert one.observation_space.contains(result[0]), one
-    for one in (picture, colours, drawn):
-        one.close()
+    picture.close()
 
 
 def test_wrappers_of_vector_environments(vector) -> None:
     env, mode = vector, vector.metadata["autoreset_mode"]
-    wrapped = [
-        many.ClipAction(env),
-        many.RescaleAction(env, -2.0, 2.0),
-        many.TransformAction(env, np.copy, ACTIONS),
-        many.VectorizeTransformAction(env, single.RescaleAction, min_action=-2.0, max_action=2.0),
-        many.ClipReward(env, -1.0, 1.0),
-        many.NormalizeReward(env),
-        many.TransformReward(env, abs),
-        many.RecordEpisodeStatistics(env),
-        many.DictInfoToList(env),
-        many.VectorizeTransformReward(env, single.TransformReward, func=abs),
-    ]
+    wrapped = [many.ClipAction(env), many.RescaleAction(env, -2.0, 2.0)]
+    wrapped += [many.TransformAction(env, np.copy, ACTIONS)]
+    wrapped += [many.VectorizeTransformAction(env, single.RescaleAction, min_action=-2.0, max_action=2.0)]
+    wrapped += [many.ClipReward(env, -1.0, 1.0), many.NormalizeReward(env), many.TransformReward(env, abs)]
+    wrapped += [many.RecordEpisodeStatistics(env), many.DictInfoToList(env)]
+    wrapped += [many.VectorizeTransformReward(env, single.TransformReward, func=abs)]
     # Gymnasium refuses the others in the other modes.
     if mode != AutoresetMode.SAME_STEP:
-        wrapped += [
-            many.DtypeObservation(env, np.float64),
-            many.FlattenObservation(env),
-            many.RescaleObservation(env, np.float32(-1), np.float32(1)),
-            many.TransformObservation(env, np.copy, env.observation_space),
-            many.ReshapeObservation(env, (2, env.single_observation_space.shape[0] // 2)),
-        ]
+        wrapped += [many.DtypeObservation(env, np.float64), many.FlattenObservation(env)]
+        wrapped += [many.RescaleObservation(env, np.float32(-1), np.float32(1))]
+        wrapped += [many.TransformObservation(env, np.copy, env.observation_space)]
+        wrapped += [many.ReshapeObservation(env, (2, env.single_observation_space.shape[0] // 2))]
     if mode == AutoresetMode.NEXT_STEP:
         wrapped.append(many.NormalizeObservation(env))
         space = {"func": np.copy, "observation_space": env.single_observation_space}
@@ -241,13 +225,52 @@ def test_wrappers_of_vector_environments(vector) -> None:
             observation, *_ = one.step(one.action_space.sample())
 
 
-def test_wrappers_of_pictures_in_vector_environments() -> None:
-    chosen = functools.partial(many.FilterObservation, filter_keys=["front_depth"])
-    for observe, wrapper in (("rgb", many.GrayscaleObservation), (["state", "depth"], chosen)):
-        one = wrapper(plab.make_vec("Move", num_envs=2, overrides=COARSE, observe=observe))
-        assert one.observation_space.contains(one.reset()[0])
-        assert one.observation_space.contains(one.step(np.zeros((2, 6)))[0])
-        one.close()
+def played(env, action: object) -> list[object]:
+    """Play an episode; return its observations."""
+    return [env.reset(seed=0)[0], *(env.step(action)[0] for _ in range(HORIZON))]
+
+
+def test_wrappers_of_pictures_in_vector_environments(pictured) -> None:
+    states = plab.make_vec("Move", num_envs=2, overrides=COARSE, **PICTURES)
+    chosen = many.FilterObservation(states, filter_keys=["front_depth"])
+    for one in (many.GrayscaleObservation(pictured[1]), chosen):
+        assert all(map(one.observation_space.contains, played(one, np.zeros((2, 6)))))
+    states.close()
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["single", "vector"])
+def test_wrappers_that_need_other_libraries(number: int, pictured, tmp_path, monkeypatch, subtests) -> None:
+    env, wrappers = pictured[number], (single, many)[number]
+    action = np.zeros(env.action_space.shape)
+    wanted = played(env, action)
+    with subtests.test("tensors"):
+        pytest.importorskip("array_api_compat")
+        for one in (wrappers.NumpyToTorch(env), wrappers.ArrayConversion(env, np, torch)):
+            seen = played(one, torch.tensor(action))
+            assert all(torch.equal(*pair) for pair in zip(seen, map(torch.tensor, wanted), strict=True))
+    with subtests.test("sizes"):
+        pytest.importorskip("cv2")
+        one = wrappers.ResizeObservation(env, (20, 30))
+        assert one.observation_space.shape[-3:] == (20, 30, 3)
+        assert all(map(one.observation_space.contains, played(one, action)))
+    pytest.importorskip("pyvista")
+    with subtests.test("films"):
+        pytest.importorskip("moviepy")
+        count = pytest.importorskip("imageio_ffmpeg").count_frames_and_secs
+        one = wrappers.RecordVideo(env, str(tmp_path), video_length=HORIZON + 1)
+        played(one, action)
+        one.stop_recording() if one.recording else None
+        (film,) = tmp_path.glob("*.mp4")
+        assert count(str(film))[0] == HORIZON + 1
+    with subtests.test("windows"):
+        pytest.importorskip("cv2")
+        pygame = pytest.importorskip("pygame")
+        monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+        one = wrappers.HumanRendering(env)
+        played(one, action)
+        shown = pygame.surfarray.array3d(one.window).swapaxes(0, 1)
+        pygame.quit()
+        assert shown.any() and (number or np.array_equal(shown, env.render()))
 
 
 def test_threads_and_forks(alone) -> None:
