@@ -60,9 +60,9 @@ class CameraSensor:
         self.width, self.height = camera.size
         self.pixels = self.width * self.height
         self._keys = ti.ndarray(ti.i64, shape=self.batch * self.pixels)
-        self.focal, self.near, self.far = camera.focal_length, camera.near, camera.far
-        # Position, and right, up and backward unit vectors.
-        self.frame = [list(camera.position), *camera.axes().tolist()]
+        axes = camera.axes()
+        self._frame = ti.ndarray(ti.f32, shape=12)
+        self._frame.from_numpy(np.concatenate([camera.position, axes.reshape(-1)]).astype(np.float32))
         self._balls = ti.ndarray(ti.f32, shape=self.batch * self.particles)
         self._labels = ti.ndarray(ti.i32, shape=self.batch * self.particles)
         self.refresh()
@@ -93,16 +93,27 @@ class CameraSensor:
             height, width], float32. ``segmentation``: labels, see :data:`BACKGROUND`, same shape, int32.
             ``rgb``: shape [batch, height, width, 3], uint8.
         """
-        self._simulator._require_runtime()
-        particles = self._simulator._particles
-        self._trace(self._keys)
-        self._splat(particles.current, particles.numbers, self._balls, self._labels, self._keys)
+        simulator, camera = self._simulator, self.camera
+        simulator._require_runtime()
+        particles = simulator._particles
+        self._trace(self._frame, self._keys, camera.focal_length, camera.near, camera.far)
+        self._splat(
+            particles.current,
+            particles.numbers,
+            self._frame,
+            self._balls,
+            self._labels,
+            self._keys,
+            camera.focal_length,
+            camera.near,
+        )
         out = {}
         for name in names or ("depth", "segmentation", "rgb"):
             depth = name == "depth"
             out[name] = self._filled(self._write, np.float32 if depth else np.int32, like, depth)
             if name == "rgb":
-                out[name] = _colours(out[name], self._filled(self._write_light, np.float32, like))
+                light = self._filled(self._write_light, np.float32, like, self._frame, camera.focal_length)
+                out[name] = _colours(out[name], light)
         return out
 
     def _filled(self, write: Any, kind: type, like: Any, *arguments: Any) -> Any:
@@ -131,33 +142,33 @@ class CameraSensor:
         return ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
 
     @ti.func
-    def axis(self, k: ti.template()):
+    def axis(self, frame: ti.template(), k: ti.template()):
         """Position (0) of the camera, and its right (1), up (2) and backward (3) axes."""
-        return ti.Vector([self.frame[k][0], self.frame[k][1], self.frame[k][2]], ti.f32)
+        return ti.Vector([frame[3 * k], frame[3 * k + 1], frame[3 * k + 2]])
 
     @ti.func
-    def ray(self, row, column):
+    def ray(self, frame: ti.template(), row, column, focal):
         """Direction of a pixel's ray, parametrised by depth."""
-        right = (ti.cast(column, ti.f32) + 0.5 - 0.5 * self.width) / self.focal
-        up = (0.5 * self.height - ti.cast(row, ti.f32) - 0.5) / self.focal
-        return right * self.axis(1) + up * self.axis(2) - self.axis(3)
+        right = (ti.cast(column, ti.f32) + 0.5 - 0.5 * self.width) / focal
+        up = (0.5 * self.height - ti.cast(row, ti.f32) - 0.5) / focal
+        return right * self.axis(frame, 1) + up * self.axis(frame, 2) - self.axis(frame, 3)
 
     @ti.kernel
-    def _trace(self, keys: Array):
+    def _trace(self, frame: Array, keys: Array, focal: ti.f32, near: ti.f32, far: ti.f32):
         """Write the floor and the manipulators."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
-            origin = self.axis(0)
-            ray = self.ray(pixel // self.width, pixel % self.width)
+            origin = self.axis(frame, 0)
+            ray = self.ray(frame, pixel // self.width, pixel % self.width, focal)
             length = ray.norm()
-            best, label = ti.cast(self.far, ti.f32), BACKGROUND
+            best, label = far, BACKGROUND
             if ray[1] < 0.0 and origin[1] > 0.0:
                 depth = -origin[1] / ray[1]
-                if depth > self.near and depth < best:
+                if depth > near and depth < best:
                     best, label = depth, FLOOR
             for shape, start, stop in ti.static(self.engine.shape_ranges):
                 for m in range(start, stop):
-                    depth = ti.cast(self.near, ti.f32)
+                    depth = near
                     for _step in range(TRACING_STEPS):
                         point = ti.cast(origin + depth * ray, self.engine.real)
                         distance = ti.cast(self.engine.end_distance(shape, e, m, point), ti.f32)
@@ -170,7 +181,17 @@ class CameraSensor:
             keys[q] = self.key(best, label)
 
     @ti.kernel
-    def _splat(self, state: Array, order: Array, balls: Array, labels: Array, keys: Array):
+    def _splat(
+        self,
+        state: Array,
+        order: Array,
+        frame: Array,
+        balls: Array,
+        labels: Array,
+        keys: Array,
+        focal: ti.f32,
+        near: ti.f32,
+    ):
         for q in range(self.engine.batch * self.engine.tiles * self.engine.lanes):
             e, place = self.engine.particle_of(q)
             if place < self.engine.particles:
@@ -178,14 +199,14 @@ class CameraSensor:
                 own = ti.cast(self.engine.vector(state, entry, place % self.engine.lanes), ti.f32)
                 number = e * self.engine.particles + order[q]
                 radius, label = balls[number], labels[number]
-                offset = own - self.axis(0)
-                depth = -offset.dot(self.axis(3))
-                if depth - radius > self.near:
-                    across = offset.dot(self.axis(1)) / depth * self.focal + 0.5 * self.width
-                    down = 0.5 * self.height - offset.dot(self.axis(2)) / depth * self.focal
+                offset = own - self.axis(frame, 0)
+                depth = -offset.dot(self.axis(frame, 3))
+                if depth - radius > near:
+                    across = offset.dot(self.axis(frame, 1)) / depth * focal + 0.5 * self.width
+                    down = 0.5 * self.height - offset.dot(self.axis(frame, 2)) / depth * focal
                     # A ball's outline is an ellipse, longest away from the middle of the picture.
                     slant = offset.norm() / depth
-                    reach = slant * radius / (depth - radius) * self.focal + 0.5
+                    reach = slant * radius / (depth - radius) * focal + 0.5
                     left = ti.max(0, ti.cast(ti.floor(across - reach), ti.i32))
                     right = ti.min(self.width - 1, ti.cast(ti.floor(across + reach), ti.i32))
                     top = ti.max(0, ti.cast(ti.floor(down - reach), ti.i32))
@@ -193,7 +214,7 @@ class CameraSensor:
                     beyond = offset.dot(offset) - radius * radius
                     for row in range(top, bottom + 1):
                         for column in range(left, right + 1):
-                            ray = self.ray(row, column)
+                            ray = self.ray(frame, row, column, focal)
                             along, square = ray.dot(offset), ray.dot(ray)
                             inside = along * along - square * beyond
                             if inside > 0.0:
@@ -210,36 +231,42 @@ class CameraSensor:
                 out[q] = ti.cast(keys[q] & 0xFFFF, ti.i32)
 
     @ti.func
-    def point(self, keys: ti.template(), e, row, column):
+    def point(self, keys: ti.template(), frame: ti.template(), e, row, column, focal):
         """Position of the surface at a pixel, relative to the camera."""
         depth = self.depth_of(keys[(e * self.height + row) * self.width + column])
-        return depth * self.ray(row, column)
+        return depth * self.ray(frame, row, column, focal)
 
     @ti.func
-    def slope(self, keys: ti.template(), e, row, column, down: ti.template()):
+    def slope(self, keys: ti.template(), frame: ti.template(), e, row, column, down: ti.template(), focal):
         """Difference in position between a pixel and its right or lower neighbour, or the opposite one if
         that is nearer in depth."""
-        here = self.point(keys, e, row, column)
+        here = self.point(keys, frame, e, row, column, focal)
         across = ti.static(0 if down else 1)
-        below, beside = ti.min(row + down, self.height - 1), ti.min(column + across, self.width - 1)
-        after = self.point(keys, e, below, beside)
-        before = self.point(keys, e, ti.max(row - down, 0), ti.max(column - across, 0))
+        after = self.point(
+            keys,
+            frame,
+            e,
+            ti.min(row + down, self.height - 1),
+            ti.min(column + across, self.width - 1),
+            focal,
+        )
+        before = self.point(keys, frame, e, ti.max(row - down, 0), ti.max(column - across, 0), focal)
         forward, backward = after - here, here - before
         use_backward = (backward.norm() < forward.norm() and backward.norm() > 0.0) or forward.norm() == 0.0
         return ti.select(use_backward, backward, forward)
 
     @ti.kernel
-    def _write_light(self, keys: Array, out: Array):
+    def _write_light(self, keys: Array, frame: Array, focal: ti.f32, out: Array):
         """Shade manipulators and bodies by the angle between their surface and a light near the camera."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
             row, column = pixel // self.width, pixel % self.width
             out[q] = 1.0
             if (keys[q] & 0xFFFF) >= FIRST_MANIPULATOR:
-                along = self.slope(keys, e, row, column, 0)
-                down = self.slope(keys, e, row, column, 1)
+                along = self.slope(keys, frame, e, row, column, 0, focal)
+                down = self.slope(keys, frame, e, row, column, 1, focal)
                 normal = down.cross(along)
-                lamp = self.axis(3) + 0.5 * self.axis(2) - 0.3 * self.axis(1)
+                lamp = self.axis(frame, 3) + 0.5 * self.axis(frame, 2) - 0.3 * self.axis(frame, 1)
                 cosine = normal.dot(lamp) / ti.max(normal.norm() * lamp.norm(), 1e-20)
                 out[q] = 0.35 + 0.65 * ti.max(cosine, 0.0)
 
