@@ -23,11 +23,7 @@ from suite import DEVICE
 os.environ["PLAB_TRACEBACK"] = "1"
 
 
-OF_ANY_DEVICE = (
-    "tests/test_simulator.py",
-    "tests/test_mixed_materials.py",
-    "tests/verification/",
-)
+OF_ANY_DEVICE = ("tests/test_simulator.py", "tests/test_mixed_materials.py", "tests/verification/")
 """Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
 FIRST = """manipulators losses simulator protocol kernel_pairs kinematics mixed_laws mixed_materials laws

@@ -19,7 +19,7 @@ from plab.problem import build_scenes, make_simulator
 from plab.results import RunResult, read
 from plab.results.running import RunFile
 from plab.runners.runner import simulator_key
-from plab.scenes import Scene
+from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator
 
 TIMES = ["seconds"]
@@ -90,6 +90,7 @@ def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options
             if sys.getrefcount(simulator) == 4:
                 with suppress(RuntimeError):  # Taichi has been restarted.
                     simulator.set_scenes(scenes)
+                    simulator._start_from([sample_particles(scene) for scene in scenes])
                     simulator.memory_mb = cfgs[0].sim.memory_mb
                     simulator.set_contact("soft")
                     simulator.set_weights({term.name: term.weight for term in simulator.terms})

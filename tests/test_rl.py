@@ -45,12 +45,8 @@ COARSE = (
     "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
     # Room for three replay buffers of METHODS, and for one that holds the whole training.
     "sim.memory_mb=0.9",
-    "method.episodes=16",
-    "method.num_envs=2",
-    "method.evaluate_every=6",
-    "method.hidden=[8]",
-    "progress=false",
-    "checkpoint_seconds=0",
+    *("method.episodes=16", "method.num_envs=2", "method.evaluate_every=6", "method.hidden=[8]"),
+    *("progress=false", "checkpoint_seconds=0"),
 )
 
 OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")

@@ -214,18 +214,27 @@ class Problem:
         self.initial_scores = [judged[kind] for kind in kinds]
         self._rescale()
 
+    def foreign_targets(self) -> dict[int, tuple[np.ndarray, None]]:
+        """Return the targets that the caller has set in the simulator since :meth:`refresh`, by environment,
+        as in :meth:`set_episode_starts`."""
+        if self.simulator.target_mass is self.target_mass:
+            return {}
+        pairs = enumerate(zip(self.simulator.target_mass, self.target_mass, strict=True))
+        return {e: (mass, None) for e, (mass, old) in pairs if not np.array_equal(mass, old)}
+
     def set_episode_starts(
         self,
         scenes: Sequence[Scene],
         particles: Mapping[int, np.ndarray],
-        targets: Mapping[int, tuple[np.ndarray, np.ndarray]],
+        targets: Mapping[int, tuple[np.ndarray, np.ndarray | None]],
     ) -> None:
         """Set the initial states of the next episodes; call :meth:`note_starts` once they have started.
 
         Args:
             scenes: One scene per environment, of the same kind as before.
             particles: Changed initial positions by environment, [particle, 3] each.
-            targets: Changed mass tensors and distances by environment, shape [n, n, n] each.
+            targets: Changed mass tensors and distances by environment, shape [n, n, n] each; None to compute
+                the distance.
 
         Raises:
             plab.scenes.SceneError: If a scene cannot be simulated; nothing is changed then.
@@ -237,7 +246,7 @@ class Problem:
         if targets:
             masses, distances = list(self.target_mass), self.distances()
             for e, (mass, distance) in targets.items():
-                masses[e], distances[e] = mass, distance
+                masses[e], distances[e] = mass, target_distance(mass) if distance is None else distance
             simulator.set_target(np.stack(masses), np.stack(distances))
             self.target_mass, self._distances = simulator.target_mass, distances
             for e in targets:

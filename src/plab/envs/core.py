@@ -166,6 +166,7 @@ class EpisodeState:
         values: Sampled parameters of each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
         stages: Numbers, accumulated rewards and scores of the stages; empty without stages.
+        changed_by_hand: The batch's ``changed_by_hand``.
     """
 
     simulation: State
@@ -173,6 +174,7 @@ class EpisodeState:
     values: tuple[Values, ...]
     starts: np.ndarray
     stages: tuple[np.ndarray, ...] = ()
+    changed_by_hand: int = 0
 
 
 _EPISODES = ("_steps", "failures", "_last", "_seeds", "_episodes", "_over")
@@ -191,7 +193,8 @@ class EpisodeBatch:
         failures: Diverged environments, with time and reason.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
-        changed_by_hand: Whether the simulator was given other scenes, materials, targets or initial states.
+        changed_by_hand: How often other scenes, materials, targets or initial states have been found in the
+            simulator.
         listener: Called with the actions and the result of each step; None if nothing listens.
     """
 
@@ -300,7 +303,7 @@ class EpisodeBatch:
 
     def _begin(self) -> None:
         """Observe the initial states before any episode has started."""
-        self.changed_by_hand = False
+        self.changed_by_hand = 0
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
             self.problem.refresh()
@@ -322,8 +325,10 @@ class EpisodeBatch:
         self.failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
         measured = self._measured()
-        self._initial = self._last = (self._observe(), *measured)
-        self._initial_loss = Constants(self.problem.loss_of(self._initial[1]))
+        # Of the initial states, unless they have changed since.
+        self._initial: tuple[Array, ...] | None = (self._observe(), *measured)
+        self._last = self._initial
+        self._initial_loss = Constants(self.problem.loss_of(self._last[1]))
 
     @property
     def problem(self) -> Problem:
@@ -353,6 +358,34 @@ class EpisodeBatch:
         self._close_renderers()
         self._sensors.refresh()
         self._new_observer()
+        self._initial = None
+
+    def _follow_changes(self, *, keep: bool) -> None:
+        """Begin again if the caller has changed scenes, targets or initial states; ``keep`` the episodes."""
+        if self._simulator.changes != self._changes:
+            state = self.get_state() if keep else None
+            self.changed_by_hand += 1
+            self.randomizer.follow()
+            if self._stages:
+                self._stages.follow(self.problem)
+            self._begin_again()
+            if state:
+                self._resume(state)
+
+    def _begin_again(self) -> None:
+        self.problem.refresh()
+        self._refresh_views()
+        self._observe_starts()
+
+    def _resume(self, state: EpisodeState) -> None:
+        """Continue from a state, with the current targets."""
+        self._simulator.set_state(state.simulation)
+        self._put(state)
+        self._update(self._observe(), self._measured(), kept=list(self.failures))
+
+    def _put(self, state: EpisodeState) -> None:
+        for name, value in copy.deepcopy(dict(state.episodes)).items():
+            setattr(self, name, value)
 
     @_alone
     def reset(
@@ -382,12 +415,7 @@ class EpisodeBatch:
             ValueError: If an option is invalid.
             RuntimeError: If the environment is closed or its simulator is invalid, as in all other methods.
         """
-        if self._simulator.changes != self._changes:
-            # The caller has changed scenes, targets or initial states.
-            self.changed_by_hand = True
-            self.problem.refresh()
-            self._refresh_views()
-            self._observe_starts()
+        self._follow_changes(keep=environments is not None)
         rows = list(range(self.size) if environments is None else map(int, environments))
         if seeds is not None:
             for e, seed in zip(rows, seeds, strict=True):
@@ -404,8 +432,10 @@ class EpisodeBatch:
         self._steps[rows], self._over[rows] = 0, False
         self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
-        if changed or self.randomizer.changed or environments is not None or on_device(like):
+        part = environments is not None or on_device(like)
+        if changed or self.randomizer.changed or part or self._initial is None:
             self._restart(rows, like, changed)
+            self._initial = self._initial if part else self._last
         else:
             self._last = self._initial
         # Copies, because callers may keep and modify them.
@@ -523,23 +553,31 @@ class EpisodeBatch:
         starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
         episodes = {name: copy.deepcopy(getattr(self, name)) for name in _EPISODES}
         stages = self._stages.saved() if self._stages else ()
-        return EpisodeState(simulation, episodes, tuple(self.randomizer.values), np.array(starts), stages)
+        values = tuple(self.randomizer.values)
+        return EpisodeState(simulation, episodes, values, np.array(starts), stages, self.changed_by_hand)
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state returned by :meth:`get_state` of a batch of the same kind; return its observations
-        and ``info``. Raise ValueError if a shape is wrong."""
+        and ``info``. Raise ValueError if a shape is wrong.
+
+        After changes of the simulator's scenes, materials, targets or initial states, losses, scores and
+        observed targets are the current ones."""
         self._simulator.set_state(state.simulation)
+        self._follow_changes(keep=False)
         changed = self.randomizer.put(dict(enumerate(state.values)))
         if self._stages:
             self._stages.restore(state.stages, self.problem)
+        if state.changed_by_hand != self.changed_by_hand:
+            self._begin_again()
+            self._resume(state)
+            return self._shown()
         if changed or self._stages:
             self._changes = self._simulator.changes
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
             self._refresh_views()
-        for name, value in copy.deepcopy(dict(state.episodes)).items():
-            setattr(self, name, value)
+        self._put(state)
         return self._shown()
 
     def _shown(self) -> tuple[Any, dict[str, Any]]:

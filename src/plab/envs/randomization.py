@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
 import numpy as np
@@ -32,13 +32,13 @@ from plab.config.randomization import (
 from plab.errors import ArgumentError, located
 from plab.objective import spread_mass, target_observation
 from plab.problem import Problem, drawn_scenes, make_targets, target_distance
-from plab.scenes import Scene, sample_particles
+from plab.scenes import Body, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import RECIPES, build_target
 from plab.targets.recipes import TensorRecipe
 
-Target = tuple[np.ndarray, np.ndarray]
-"""Mass tensor of a target, and the distance to it."""
+Target = tuple[np.ndarray, np.ndarray | None]
+"""Mass tensor of a target, and the distance to it, or None to compute it when it is needed."""
 
 
 @dataclass(eq=False)
@@ -48,6 +48,9 @@ class _Base:
     cfg: Config
     scene: Scene
     target: Target
+
+    def __post_init__(self) -> None:
+        self.configured_mass = self.target[0]
 
     @functools.cached_property
     def particles(self) -> np.ndarray:
@@ -88,6 +91,8 @@ class EpisodeRandomizer:
         }
         targets = zip(problem.target_mass, problem.distances(), strict=True)
         self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, targets, strict=True)]
+        # With the changes that the caller has made in the simulator.
+        self._scenes = list(problem.scenes)
         self._placed: list[Any] = [(base, {}, _places(base.scene)) for base in self._bases]
         self._targets: list[Any] = [None for _ in cfgs]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
@@ -103,6 +108,16 @@ class EpisodeRandomizer:
     def release(self) -> None:
         """Release the simulator and its memory."""
         self._problem = None
+
+    def follow(self) -> None:
+        """Keep scenes and targets that the caller has set in the simulator, except for sampled values."""
+        problem = cast(Problem, self._problem)
+        for e, (before, after) in enumerate(zip(problem.scenes, problem.simulator.scenes, strict=True)):
+            if before is not after:
+                self._scenes[e] = _applied(self._scenes[e], before, after)
+                self._placed[e] = *self._placed[e][:2], _places(after)
+        for e, target in problem.foreign_targets().items():
+            self._bases[e].target = target
 
     def noise(self) -> np.ndarray:
         """Return the standard deviations of the noise on observations, shape [batch]."""
@@ -142,7 +157,7 @@ class EpisodeRandomizer:
             base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]
             cfg = with_values(base.cfg, own)
             with located(", ".join(own), ArgumentError):
-                scenes[e] = self._checked(cfg)
+                scenes[e] = _applied(self._scenes[e], self._bases[e].scene, self._checked(cfg))
             place = base, yaws(cfg.task, own), _places(scenes[e])
             if place != self._placed[e]:
                 particles[e] = _moved(*place)
@@ -190,9 +205,23 @@ class EpisodeRandomizer:
             return base.target
         with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
-            same = np.array_equal(mass, base.target[0])
+            same = np.array_equal(mass, base.configured_mass)
             target = base.target if same else (mass, target_distance(mass))
         return target
+
+
+def _applied(value: Any, before: Any, after: Any) -> Any:
+    """Return a value, such as a scene, with the differences between two others; bodies, manipulators and
+    their attributes are compared one by one."""
+    if before == after:
+        return value
+    if value != before and isinstance(before, Scene | Body | Manipulator):
+        names = [one.name for one in fields(before)]
+        trios = {name: [getattr(one, name) for one in (value, before, after)] for name in names}
+        return replace(value, **{name: _applied(*trio) for name, trio in trios.items()})
+    if value != before and isinstance(before, tuple) and isinstance(before[0], Body | Manipulator):
+        return tuple(map(_applied, value, before, after))
+    return after
 
 
 def _places(scene: Scene) -> list[Any]:
@@ -284,6 +313,11 @@ class Stages:
         changed = bool((stages != self.current).any())
         self.enter(stages, problem)
         return changed
+
+    def follow(self, problem: Problem) -> None:
+        """Keep targets that the caller has set in the simulator as those of the current stages."""
+        for e, target in problem.foreign_targets().items():
+            self._targets[self.current[e]][e] = target
 
     def saved(self) -> tuple[np.ndarray, ...]:
         """Return a copy of the episode's state, for :meth:`restore`."""

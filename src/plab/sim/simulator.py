@@ -284,7 +284,8 @@ class Simulator:
         """Replace all scenes by scenes of the same kind between episodes, without recompilation.
 
         Current states, targets, contact model and weights are unchanged. Environments keep their initial
-        particles unless new ones are given.
+        particles unless new ones are given, and manipulators their initial poses unless those of the scene
+        differ.
 
         Args:
             scenes: One scene per environment.
@@ -297,11 +298,16 @@ class Simulator:
         self._require_runtime()
         self._require_fitting(scenes)
         held = {e: self._checked_particles(x, f"particles[{e}]") for e, x in particles.items()}
+        before, poses, joints = initial_poses(self.scenes), self._initial_poses, self._initial_joints
         self.scenes = tuple(scenes)
         self.changes += 1
         self._version += 1
         self._engine.fill_parameters(scenes)
         self._start_manipulators()
+        same = (self._initial_poses == before).all(axis=2)
+        self._initial_poses[same] = poses[same]
+        if joints is not None:
+            self._initial_joints = np.where(same.all(axis=1)[:, None], joints, self._initial_joints)
         for e, x in held.items():
             order = self._particles.initial[e].astype(np.int32)
             self._engine.place_at_rest(self._initial, e, order, x.reshape(-1))
