@@ -211,12 +211,15 @@ def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
     assert main(["sql", sql, str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"task": "Rope", "n": 3, "mean": 1.0, "nil": None}]
     assert str(folder / "no") in told(["sql", "select 1", str(folder / "no")], main)
-    odd = f"{sys.executable} -m plab results sql 'select chr(27) || chr(177) a' {folder}"
-    ascii = os.environ | {"PYTHONIOENCODING": "ascii"}
-    assert subprocess.run(odd, shell=True, env=ascii, stdout=subprocess.PIPE).stdout == b"a\n\\xb1\n"
+    odd = (
+        f"PYTHONIOENCODING=ascii {sys.executable} -m plab results sql 'select chr(27) || chr(177) a' {folder}"
+    )
+    assert subprocess.run(odd, shell=True, stdout=subprocess.PIPE).stdout == b"a\n\\xb1\n"
     assert subprocess.run(f"{odd} >&-", shell=True).returncode == 0
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # by xdist
     threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
     assert main(["sql", "select count(*) from range(100000000000) a, range(100000000)", str(folder)]) == 130
+    signal.signal(signal.SIGINT, ignored)
 
 
 def test_scores(folder: Path, told, capsys) -> None:

@@ -82,8 +82,7 @@ def test_missing_gpus_and_packages_are_named(refused, monkeypatch) -> None:
 @pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/locks").exists(), reason="finds the processes of runs in /proc/locks")
 @pytest.mark.parametrize(
-    ("launcher", "package"),
-    [("joblib", "joblib"), ("submitit_local", "submitit"), ("gpus", "torch")],
+    ("launcher", "package"), [("joblib", "joblib"), ("submitit_local", "submitit"), ("gpus", "torch")]
 )
 def test_a_sweep_with_a_killed_job_is_completed_by_the_same_command(tmp_path, launcher, package) -> None:
     pytest.importorskip(package)
