@@ -211,9 +211,7 @@ def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
     assert main(["sql", sql, str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"task": "Rope", "n": 3, "mean": 1.0, "nil": None}]
     assert str(folder / "no") in told(["sql", "select 1", str(folder / "no")], main)
-    odd = (
-        f"PYTHONIOENCODING=ascii {sys.executable} -m plab results sql 'select chr(27) || chr(177) a' {folder}"
-    )
+    odd = f"PYTHONIOENCODING=ascii {sys.executable} -m plab results sql 'select chr(27)||chr(177) a' {folder}"
     assert subprocess.run(odd, shell=True, stdout=subprocess.PIPE).stdout == b"a\n\\xb1\n"
     assert subprocess.run(f"{odd} >&-", shell=True).returncode == 0
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # by xdist
