@@ -1,5 +1,5 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
-# make test   set up .venv and run the tests, in seven minutes on two cores
+# make test   set up .venv and run the tests, in nine minutes on two cores
 # make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
 #
 # With the development tools; CONTRIBUTING.md has more about them:
