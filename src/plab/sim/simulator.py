@@ -306,8 +306,8 @@ class Simulator:
         self._start_manipulators()
         same = (self._initial_poses == before).all(axis=2)
         self._initial_poses[same] = poses[same]
-        if joints is not None:
-            self._initial_joints = np.where(same.all(axis=1)[:, None], joints, self._initial_joints)
+        if joints is not None and self._map is not None:
+            self._initial_joints = np.where(same.all(axis=1)[:, None], joints, self._map.start)
         for e, x in held.items():
             order = self._particles.initial[e].astype(np.int32)
             self._engine.place_at_rest(self._initial, e, order, x.reshape(-1))
