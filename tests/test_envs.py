@@ -196,7 +196,7 @@ def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVe
 
 @pytest.mark.parametrize("drawn", [False, True])
 def test_a_reset_follows_changes_of_the_simulator(drawn: bool) -> None:
-    """After each change, an environment is one whose configuration says so, and samples all other values."""
+    """After each change, episodes equal those of an environment configured with the new value."""
     pytest.importorskip("pyvista")
     ranges = {"poisson_ratio": [0.1, 0.3], "manipulators": {"left": {"friction": [0.1, 0.9]}}}
     keys = ["state", "mass", "target_mass", "target_points", "points", "impulses", "depth"]
@@ -237,7 +237,7 @@ def test_a_reset_follows_changes_of_the_simulator(drawn: bool) -> None:
         change()
         assert data_equivalence(env.set_state(kept), (seen, info), exact=True)
         played = [[one.reset(seed=3), *map(one.step, random_actions())] for one in (env, other)]
-        # Initial states of others have another order of particles, rounded differently.
+        # With another initial state the order of particles differs, and with it rounding.
         for a, b in zip(*map(tree_leaves, played), strict=True):
             np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-4, atol=2e-4)
         assert change is start or data_equivalence(env.render(), other.render(), exact=True)

@@ -561,8 +561,8 @@ class EpisodeBatch:
         """Restore a state returned by :meth:`get_state` of a batch of the same kind; return its observations
         and ``info``. Raise ValueError if a shape is wrong.
 
-        After changes of the simulator's scenes, materials, targets or initial states, losses, scores and
-        observed targets are the current ones."""
+        After changes of the simulator's scenes, materials, targets or initial states, losses and scores are
+        computed with the current targets, which are also the observed ones."""
         self._simulator.set_state(state.simulation)
         self._follow_changes(keep=False)
         changed = self.randomizer.put(dict(enumerate(state.values)))

@@ -279,6 +279,7 @@ class Runner:
         self._phase, self._since, self._timed, self._shown = "", 0.0, self.tracks, ""
 
     # ------------------------------------------------------------------------------------------------ hooks
+    # Not abstract methods: a runner overrides either step or iterate, which the class cannot express.
 
     def build(self) -> None:
         """Check that the runs can be executed, and create their shared objects, at least :attr:`problem`."""
