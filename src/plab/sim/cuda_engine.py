@@ -68,8 +68,10 @@ class CudaEngine(CudaPhases):
         blocks = device_attribute(MULTIPROCESSORS) * fitting
         self.resident_threads = blocks * RESIDENT_BLOCK
         self.last_arrival = ctypes.c_int32((1 << 31) - (blocks - 1)).value
-        # Few particles are distributed over more warps, so that each finishes earlier.
-        self.parts = max(1, min(MAX_TILE_WARPS, self.resident_threads // self.particle_threads))
+        # Few particles are distributed over more warps, so that each finishes earlier; those of a tile are in
+        # one block.
+        parts = min(MAX_TILE_WARPS, self.resident_threads // self.particle_threads)
+        self.parts = 1 << max(0, parts.bit_length() - 1)
         self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
         self.mass_blocks = ti.field(ti.i32, shape=1)
@@ -83,15 +85,14 @@ class CudaEngine(CudaPhases):
         """True if a step is a single launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
         # Blocks that move poses are among the resident ones.
-        fits = few and self.frame_threads <= self.resident_threads
-        return fits and not self.deterministic
+        return few and self.frame_threads <= self.resident_threads
 
     @property
     def sorts(self) -> bool:
         """True if particles are sorted by cell before each step. This pays off with many particles, when
-        atomics take more time than launches. Not supported with several materials, which are stored by place,
-        and in deterministic simulators, because the order within a cell depends on timing."""
-        return not self.resident and not self.mixed and not self.deterministic
+        atomics take more time than launches, but sums are only independent of the batch if all sort. Not
+        supported with several materials, which are stored by place."""
+        return not self.mixed and (self.deterministic or not self.resident)
 
     # -- public methods -----------------------------------------------------------------------------
 
@@ -119,6 +120,8 @@ class CudaEngine(CudaPhases):
         if contact and self.resident:
             self.resident_adjoint_kernel(state, bar, slot, stamp + 1)
         elif contact:
+            if self.deterministic:
+                self.bound_kernel(bar)
             for s in reversed(range(self.substeps)):
                 self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1)
         self.retreat_kernel(actions, actions_bar, t)
@@ -179,8 +182,8 @@ class CudaEngine(CudaPhases):
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, time, self.parts)
-                # Each warp scatters the particles that it has gathered, so no barrier is needed.
-                self.wait_for_warp()
+                # Each block scatters the particles that it has gathered.
+                ti.simt.block.sync()
             if w == 0:
                 self.block_count[0] = 0
 
@@ -188,8 +191,8 @@ class CudaEngine(CudaPhases):
     def losses(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
         """Write the measures of all environments to ``terms`` from entry ``at``, and mass and the derivative
         of the loss to the nodes of active blocks."""
-        for q in range(self.part_threads):
-            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, self.parts)
+        for q in range(self.particle_threads):
+            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, 1)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
             particle = tile * self.lanes + lane
             self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
@@ -240,25 +243,29 @@ class CudaEngine(CudaPhases):
             self.nearest_gradient(state, slot, bar, e)
 
     @ti.kernel
+    def bound_kernel(self, bar: Array):
+        """Bound the contributions to the adjoint of the grid velocities in the last substep."""
+        for q in range(self.particle_threads):
+            self.bound_thread(bar, q, self.substeps - 1, 1)
+
+    @ti.kernel
     def substep_adjoint_kernel(
         self, state: Array, bar: Array, before: ti.i32, after: ti.i32, s: ti.i32, stamp: ti.i32
     ):
         """Run the adjoint of substep s: scatter again, with the adjoint of the grid velocities, and
         backpropagate."""
-        if ti.static(self.deterministic):
-            for e in range(self.batch):
-                self.adjoint_bound[e] = 0
-            for q in range(self.particle_threads):
-                self.bound_thread(state, bar, before, after, q)
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
-            self.scatter_thread_adjoint(state, bar, before, after, q, stamp, 1)
+            self.scatter_thread_adjoint(state, bar, before, after, q, s, stamp, 1, 0, False)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
+            self.clear_bound(w, s - 1)
             for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
-            self.gather_thread_adjoint(state, bar, before, after, q, 1)
+            self.gather_thread_adjoint(state, bar, before, after, q, s, 1)
+            if s == 0:
+                self.clear_bound(q, s)
 
     @ti.kernel
     def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
@@ -266,20 +273,40 @@ class CudaEngine(CudaPhases):
         :meth:`resident_step_kernel`."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
+            arrivals = self.arrived()
+            if ti.static(self.deterministic):
+                for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
+                    q = w + turn * self.resident_threads
+                    self.bound_thread(bar, q, self.substeps - 1, self.parts)
+                self.arrive(w)
             for back in range(self.substeps):
                 s = self.substeps - 1 - back
                 before = slot + s
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp, self.parts)
+                    self.scatter_thread_adjoint(
+                        state, bar, before, before + 1, q, s, stamp, self.parts, arrivals, self.deterministic
+                    )
+                if ti.static(self.deterministic):
+                    if w >= self.part_threads:
+                        self.wait_in_warp(w, arrivals)
+                    # There are three arrivals per substep.
+                    arrivals = ~arrivals
                 self.barrier_all(w)
+                self.clear_bound(w, s - 1)
                 for turn in range(self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))):
                     self.grid_thread_adjoint(w, w + turn * self.resident_threads, s)
                 self.barrier_all(w)
                 for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.gather_thread_adjoint(state, bar, before, before + 1, q, self.parts)
-                self.wait_for_warp()
+                    self.gather_thread_adjoint(state, bar, before, before + 1, q, s, self.parts)
+                if ti.static(self.deterministic):
+                    # The bound is that of all particles, and only needed after the scatter of momentum.
+                    if s > 0:
+                        self.arrive(w)
+                else:
+                    ti.simt.block.sync()
+            self.clear_bound(w, 0)
 
     @ti.kernel
     def retreat_kernel(self, actions: Array, actions_bar: Array, t: ti.i32):

@@ -81,7 +81,7 @@ class CudaPhases(OrderPhases, PosePhases):
         shares = (self.batch, self.substeps, max(1, self.manipulators))
         self.end_share = ti.Vector.field(8, ti.f64, shape=shares)
         self.start_share = ti.Vector.field(8, ti.f64, shape=shares)
-        self.adjoint_bound = ti.field(ti.i32, shape=self.batch)
+        self.adjoint_bound = ti.field(ti.i32, shape=2 * self.batch)
         self.frame_sums = self.sums(self.batch * self.substeps * max(1, self.manipulators) * FRAME_ADJOINT)
         self.pose_sums = self.sums(self.batch * max(1, self.manipulators) * 8)
         self.material_sums = self.sums(self.material_bar.shape[0] * self.coefficients)
@@ -401,23 +401,23 @@ class CudaPhases(OrderPhases, PosePhases):
     def own_particle(self, q, parts: ti.template()):
         """Return environment and number of thread q's particle, with ``parts`` warps sharing the particles of
         a tile in contiguous parts, and whether the thread has a particle."""
-        share = ti.static((WARP + parts - 1) // parts)
+        share = ti.static(WARP // parts)
         unit, place = q // WARP, q % WARP + q // WARP % parts * share
         e, particle = self.particle_of(unit // parts * WARP + ti.min(place, WARP - 1))
-        return e, particle, particle < self.particles and q % WARP < share and place < WARP
+        return e, particle, particle < self.particles and q % WARP < share
 
     @ti.func
     def sorted_particle(self, state: ti.template(), slot, q, parts: ti.template()):
-        """Return thread q's particle when its warp's part of a tile, see :meth:`own_particle`, is sorted by
-        base node; all lanes of a warp must take part.
+        """Return thread q's particle when the warp's tile, which ``parts`` warps share, is sorted by base
+        node; all lanes of a warp must take part.
 
         Returns environment, tile, entry of the tile, lane, position, base node, x / dx - base, and
         the base node's grid index, or a distinct negative index without a particle.
         """
-        e, particle, own = self.own_particle(q, parts)
+        e, particle = self.particle_of(q // WARP // parts * WARP + q % WARP)
         tile = particle // self.lanes
         entry = self.tile_entry(slot, e, tile)
-        lane, taken = self.sorted_lane(state, entry, particle % self.lanes, own, q % WARP)
+        lane, taken = self.sorted_lane(state, entry, particle < self.particles, q % WARP)
         x = self.vector(state, entry, lane)
         base, fx = self.stencil(x)
         node = e * self.nodes + self.linear(base)
@@ -446,29 +446,51 @@ class CudaPhases(OrderPhases, PosePhases):
                 self.set_frame(q % self.batch, number // count, q // self.batch)
 
     @ti.func
-    def barrier_all(self, w):
-        """Wait until all resident threads have arrived and their writes are visible."""
+    def arrived(self):
+        """Return the counter of arrivals at barriers, which changes its sign when all blocks have arrived."""
+        return look(ti.get_addr(self.arrivals, 0))
+
+    @ti.func
+    def arrive(self, w):
+        """Make the writes of a resident block visible to threads after :meth:`wait_for_all`; return the
+        counter before to the block's first thread."""
+        before = 0
         ti.simt.block.sync()
         if w % RESIDENT_BLOCK == 0:
             # After a block barrier, the fence of one thread covers the writes of the whole block.
             grid_memory_fence()
             # The increments of all blocks flip the sign, so the counter needs no reset.
             before = ti.atomic_add(self.arrivals[0], ti.select(w == 0, self.last_arrival, 1))
-            while (before ^ look(ti.get_addr(self.arrivals, 0))) >= 0:
-                pass
-            # Writes of other processors must not be read from the local cache.
-            grid_memory_fence()
+        return before
+
+    @ti.func
+    def wait_for_all(self, before):
+        """Wait until all blocks have arrived, given the counter before or a number of its sign."""
+        while (before ^ self.arrived()) >= 0:
+            pass
+        # Writes of other processors must not be read from the local cache.
+        grid_memory_fence()
+
+    @ti.func
+    def barrier_all(self, w):
+        """Wait until all resident threads have arrived and their writes are visible."""
+        before = self.arrive(w)
+        if w % RESIDENT_BLOCK == 0:
+            self.wait_for_all(before)
         ti.simt.block.sync()
+
+    @ti.func
+    def wait_in_warp(self, w, before):
+        if w % WARP == 0:
+            self.wait_for_all(before)
+        self.wait_for_warp()
 
     @ti.func
     def scatter_thread(self, state: ti.template(), before, after, q, time, stamp, parts: ti.template()):
         """Update and scatter a particle of thread q's tile; all lanes of a warp must take part. ``time`` is
-        recorded if a value exceeds the range of the integers.
-
-        ``time`` is recorded if a value is outside the range of the integers.
-        """
-        e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q, parts)
-        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
+        recorded if a value is outside the range of the integers."""
+        e, tile, source, lane, _x, base, fx, at = self.sorted_particle(state, before, q, parts)
+        node, first, heads, ends = self.own_runs(at, q, parts)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
@@ -483,14 +505,14 @@ class CudaPhases(OrderPhases, PosePhases):
         w = spline(fx)
         scale = self.momentum_scale(1)
         self.scatter_runs(
-            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, taking, False, 0
+            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, ends, False, 0
         )
 
     @ti.func
     def scatter_mass_thread(self, q, e, base, fx, node, stamp):
         """Add the mass of thread q's particle to its 27 nodes, as :meth:`scatter_mass` does; all lanes of a
         warp must take part."""
-        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
+        _node, first, heads, ends = self.own_runs(node, q, 1)
         if first:
             self.mark_shared(e, base, stamp)
         rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
@@ -498,7 +520,7 @@ class CudaPhases(OrderPhases, PosePhases):
         scale, w = self.momentum_scale(1), spline(fx)
         folds = ti.cast(base[0] == 0, ti.i32) | (ti.cast(base[1] == 0, ti.i32) << 1)
         folds |= ti.cast(base[2] == 0, ti.i32) << 2
-        self.scatter_runs(self.momentum, MASS, rows, q, w, field, scale, node, heads, taking, True, folds)
+        self.scatter_runs(self.momentum, MASS, rows, q, w, field, scale, node, heads, ends, True, folds)
 
     @ti.func
     def grid_thread(self, w, q, s):
@@ -516,14 +538,25 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def scatter_thread_adjoint(
-        self, state: ti.template(), bar: ti.template(), before, after, q, stamp, parts: ti.template()
+        self,
+        state: ti.template(),
+        bar: ti.template(),
+        before,
+        after,
+        q,
+        s,
+        stamp,
+        parts: ti.template(),
+        arrivals,
+        waits: ti.template(),
     ):
         """Scatter a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes of
-        a warp must take part."""
-        e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q, parts)
+        a warp must take part. If ``waits``, the bound is known when all blocks have arrived, and ``arrivals``
+        has the sign of the counter before."""
+        e, tile, source, lane, x, base, fx, at = self.sorted_particle(state, before, q, parts)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
-        first, heads, taking = self.run_heads(node, node >= 0, q % WARP)
+        node, first, heads, ends = self.own_runs(at, q, parts)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
@@ -536,11 +569,13 @@ class CudaPhases(OrderPhases, PosePhases):
         w = spline(fx)
         scale = self.momentum_scale(1)
         self.scatter_runs(
-            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, taking, False, 0
+            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, ends, False, 0
         )
         h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
-        scale = self.adjoint_scale(e, 1)
-        self.scatter_runs(self.velocity_bar, VELOCITY, rows, q, w, h, scale, node, heads, taking, False, 0)
+        if ti.static(waits):
+            self.wait_in_warp(q, arrivals)
+        scale = self.adjoint_scale(self.bound_of(e, s), 1)
+        self.scatter_runs(self.velocity_bar, VELOCITY, rows, q, w, h, scale, node, heads, ends, False, 0)
 
     @ti.func
     def grid_thread_adjoint(self, w, q, s):
@@ -550,7 +585,7 @@ class CudaPhases(OrderPhases, PosePhases):
         i = self.node_of_block(block, r)
         unit = self.momentum_scale(-1)
         total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
-        unit = self.adjoint_scale(e, -1)
+        unit = self.adjoint_scale(self.bound_of(e, s), -1)
         bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r, unit)
         near = 0
         if ti.static(self.manipulators > MAX_TESTED_MANIPULATORS):
@@ -564,29 +599,43 @@ class CudaPhases(OrderPhases, PosePhases):
         self.put_nodes(self.momentum_bar, shared, w, e, block, r, total_bar)
 
     @ti.func
-    def bound_thread(self, state: ti.template(), bar: ti.template(), before, after, q):
-        """Bound the contribution of thread q's particle to the adjoint of the grid velocities; all lanes of a
-        warp must take part and belong to one environment."""
-        e, particle = self.particle_of(q)
+    def bound_of(self, e, s):
+        """Index of an environment's bound in substep s; two alternate."""
+        return 2 * e + (s & 1)
+
+    @ti.func
+    def clear_bound(self, w, s):
+        """Clear the bound of substep s of an environment per thread."""
+        if ti.static(self.deterministic):
+            if w < self.batch:
+                self.adjoint_bound[self.bound_of(w, s)] = 0
+
+    @ti.func
+    def bound_thread(self, bar: ti.template(), q, s, parts: ti.template()):
+        """Bound the contribution of thread q's particle to the adjoint of the grid velocities in substep s;
+        all lanes of a warp must take part and belong to one environment."""
+        e, particle, own = self.own_particle(q, parts)
         bits = 0
-        if particle < self.particles:
-            tile = particle // self.lanes
-            lane = particle & (self.lanes - 1)
-            x = self.vector(state, self.tile_entry(before, e, tile), lane)
-            _base, fx = self.stencil(x)
-            target = self.tile_entry(after, e, tile)
-            h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
-            bits = self.bits_of(self.largest_share(h))
+        if own:
+            entry, lane = self.tile_entry(0, e, particle // self.lanes), particle & (self.lanes - 1)
+            bound = 0.0 * self.dt
+            for i in ti.static(range(3)):
+                bound += ti.abs(bar[entry + AT_V + i][lane]) + self.dt * ti.abs(bar[entry + i][lane])
+            # Nodes are at most 1.5 cells from the particle along each axis.
+            for i in ti.static(range(9)):
+                bound += 6.0 * self.inv_dx * ti.abs(bar[entry + AT_C + i][lane])
+            bits = self.bits_of(bound)
         for k in ti.static(range(RUN_BITS)):
             bits = ti.max(bits, ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), bits, 1 << k))
         if q % WARP == 0:
-            ti.atomic_max(self.adjoint_bound[e], bits)
+            ti.atomic_max(self.adjoint_bound[self.bound_of(e, s)], bits)
 
     @ti.func
     def gather_thread_adjoint(
-        self, state: ti.template(), bar: ti.template(), before, after, q, parts: ti.template()
+        self, state: ti.template(), bar: ti.template(), before, after, q, s, parts: ti.template()
     ):
-        """Adjoint of both transfers and the material for thread q's particle."""
+        """Adjoint of both transfers and the material for thread q's particle in substep s, then the bound for
+        the previous substep; all lanes of a warp must take part."""
         e, particle, own = self.own_particle(q, parts)
         if own:
             tile = particle // self.lanes
@@ -598,6 +647,9 @@ class CudaPhases(OrderPhases, PosePhases):
                 state, source, self.tile_entry(after, e, tile), bar, entry, entry9, lane, e
             )
             self.material_particle_adjoint(state, source, bar, entry, a_bar, lane, e)
+        if ti.static(self.deterministic):
+            if s > 0:
+                self.bound_thread(bar, q, s - 1, parts)
 
     @ti.func
     def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):

@@ -100,7 +100,8 @@ class SumPhases(Storage):
     """Atomic sums; integer sums in a deterministic simulator.
 
     Attributes:
-        adjoint_bound: Upper bound on contributions to a node's adjoint by environment; see :meth:`bits_of`.
+        adjoint_bound: Upper bounds on contributions to a node's adjoint, two per environment; see
+            :meth:`bits_of`.
     """
 
     adjoint_bound: ti.Field
@@ -186,12 +187,12 @@ class SumPhases(Storage):
         return ti.Vector([momentum, momentum, momentum, mass])
 
     @ti.func
-    def adjoint_scale(self, e, power: ti.template()):
-        """Units of a node's adjoint per 1 in an environment, as a constant 4-vector; the inverse for
-        ``power`` -1, non-finite if an adjoint is."""
+    def adjoint_scale(self, bound, power: ti.template()):
+        """Units of a node's adjoint per 1, as a constant 4-vector, given the index of a bound; the inverse
+        for ``power`` -1, non-finite if an adjoint is."""
         number = ti.cast(1.0, ti.f32)
         if ti.static(self.deterministic):
-            bits = self.adjoint_bound[e]
+            bits = self.adjoint_bound[bound]
             exponent = ti.min(ti.max((bits >> 23) - 127, LEAST_EXPONENT), 127)
             number = ti.bit_cast((127 + power * (ADJOINT_BITS - exponent)) << 23, ti.f32)
             if ti.static(power < 0):

@@ -5,15 +5,15 @@ Memory transactions have 32 bytes. If each thread reads or writes its own 4-vect
 quarter is used, and atomics are equally slow. Therefore neighbouring lanes access neighbouring numbers, and
 values are exchanged in shared memory.
 
-Particles are sorted by cell before every environment step with a counting sort. The order within a cell
-depends on timing.
+Particles are sorted before every environment step with a counting sort, by block of the grid, cell and
+number, so that their order depends on the state only.
 """
 
 from plab.sim.compiler import ti
 from plab.sim.cuda_sums import SumPhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import BLOCK_BITS, BYTES, STATE
+from plab.sim.storage import BLOCK, BLOCK_BITS, BYTES, STATE
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 
@@ -206,13 +206,13 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     # for any order of particles.
 
     @ti.func
-    def sorted_lane(self, state: ti.template(), source, place, own, lane):
-        """Sort the particles of a tile by base node, one at the ``place`` of each lane with ``own``; return
-        the lane's particle, and whether it has one."""
-        base, _fx = self.stencil(self.vector(state, source, place))
+    def sorted_lane(self, state: ti.template(), source, own, lane):
+        """Sort the particles of a tile by base node, one in each lane with ``own``; return the lane's
+        particle, and whether it has one."""
+        base, _fx = self.stencil(self.vector(state, source, lane))
         node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.
-        packed = node * self.lanes + place
+        packed = node * self.lanes + lane
         for stage in ti.static(range(1, RUN_BITS + 1)):
             for step in ti.static(range(stage - 1, -1, -1)):
                 other = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), packed, 1 << step)
@@ -225,18 +225,30 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         return packed & (self.lanes - 1), packed < self.nodes * self.lanes
 
     @ti.func
-    def run_heads(self, key, taking_part, lane):
-        """Find runs of neighbouring lanes with equal keys in a warp. Either all lanes of a run take part or
-        none, and participating lanes come first.
+    def own_runs(self, node, q, parts: ti.template()):
+        """Find runs of neighbouring lanes with equal nodes; lanes without a particle have negative nodes and
+        come last. ``parts`` warps process the runs of a tile by turns, so that the sum over a run does not
+        depend on the number of parts.
 
-        Returns whether this is the first lane of a run that takes part, a bit for each lane that is, and how
-        many lanes take part.
+        Returns the lane's node, negative if its run belongs to another warp, whether it is the first lane of
+        an own run, a bit for each lane that is, and a bit for the end of each run.
         """
-        key_below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), key, 1)
-        first = taking_part and (lane == 0 or key_below != key)
-        heads = ti.simt.warp.ballot(ti.cast(first, ti.i32))
-        taking = ti.simt.warp.ballot(ti.cast(taking_part, ti.i32))
-        return first, ti.cast(heads, ti.u32), ti.cast(ti.math.popcnt(ti.cast(taking, ti.u32)), ti.i32)
+        lane = q % WARP
+        below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), node, 1)
+        first = node >= 0 and (lane == 0 or below != node)
+        heads = ti.cast(ti.simt.warp.ballot(ti.cast(first, ti.i32)), ti.u32)
+        taking = ti.cast(ti.simt.warp.ballot(ti.cast(node >= 0, ti.i32)), ti.u32)
+        # Lanes without a particle begin at the lowest bit of their complement.
+        ends = heads | (~taking & (taking + 1))
+        own = heads
+        if ti.static(parts > 1):
+            upto = heads & ~(ti.u32(ALL_LANES - 1) << lane)
+            number = ti.cast(ti.math.popcnt(upto), ti.i32)
+            if (number - 1) % parts != q // WARP % parts:
+                node = -1
+            first = first and node >= 0
+            own = ti.cast(ti.simt.warp.ballot(ti.cast(first, ti.i32)), ti.u32)
+        return node, first, own, ends
 
     @ti.func
     def lowest_bit(self, bits):
@@ -255,7 +267,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         scale: ti.template(),
         node,
         heads,
-        taking,
+        ends,
         folded: ti.template(),
         folds,
     ):
@@ -266,7 +278,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         numbers. Then the lanes correspond to the components of the nine columns of a run's stencil, and each
         sums the contributions of the run to its three nodes. Finally the sums are permuted, so that
         neighbouring lanes add neighbouring numbers to the grid: the device combines up to 8 of them.
-        ``heads`` and ``taking`` are those of :meth:`run_heads` for the base nodes, ``node``; ``scale`` is
+        ``node``, ``heads`` and ``ends`` are those of :meth:`own_runs`; ``scale`` is
         that of :meth:`add_to_grid`. If ``folded``, nodes are those of :meth:`folded_node`; ``folds`` has a
         bit for each axis along which the base node is the first.
         """
@@ -301,10 +313,11 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         first = ti.get_addr(grid, 0)
         rest = heads
         while rest != 0:
-            begin, end = self.lowest_bit(rest), taking
+            begin, end = self.lowest_bit(rest), WARP
             rest &= rest - 1
-            if rest != 0:
-                end = self.lowest_bit(rest)
+            after = ends & (ti.u32(ALL_LANES - 1) << begin)
+            if after != 0:
+                end = self.lowest_bit(after)
             total = ti.Vector.zero(self.real, 4)
             for p in range(begin, end):
                 row = p * ROW_STRIDE
@@ -359,8 +372,15 @@ class OrderPhases(WarpPhases):
         if hasattr(self, "cell_count"):
             return
         self.cell_count = ti.field(ti.i32, shape=self.batch * self.nodes)
-        self.rank = ti.field(ti.i32, shape=self.batch * self.tiles * self.lanes)
-        self.placed = ti.field(ti.i32, shape=self.batch)
+        # Numbers of particles in the parts of blocks that warps count, and in rows of parts.
+        self.count_parts = self.blocks << (NODE_BITS - RUN_BITS)
+        self.row_bits = self.count_parts.bit_length() // 2
+        self.rows = -(-self.count_parts >> self.row_bits)
+        self.part_count = ti.field(ti.i32, shape=self.batch * self.count_parts)
+        self.row_count = ti.field(ti.i32, shape=self.batch * self.rows)
+        # Places of particles in the order of their cells, and cell and number of the particle at each place.
+        self.cell_place = ti.field(ti.i32, shape=self.batch * self.tiles * self.lanes)
+        self.cell_key = ti.field(ti.i64, shape=self.batch * self.tiles * self.lanes)
 
     @ti.func
     def mark_shared(self, e, base, stamp):
@@ -382,6 +402,36 @@ class OrderPhases(WarpPhases):
         base, _fx = self.stencil(self.vector(state, entry, particle % self.lanes))
         return base
 
+    @ti.func
+    def counted(self, e, i):
+        """Return the indices of a node, and of its part and row of counts."""
+        block, _crossing = self.block_of(i)
+        slab = (i[0] & ti.static(BLOCK - 1)) * ti.static(BLOCK**2) >> RUN_BITS
+        part = (block << ti.static(NODE_BITS - RUN_BITS)) + slab
+        row = e * self.rows + (part >> self.row_bits)
+        return e * self.nodes + self.linear(i), e * self.count_parts + part, row
+
+    @ti.func
+    def place_in_cell(self, first, place):
+        """Return the place by number among the particles of a cell, which are stored in any order, given the
+        place of one; ``first`` is the environment's first."""
+        own = self.cell_key[first + place]
+        below, begin = 0, place
+        while begin > 0:
+            key = self.cell_key[first + begin - 1]
+            if key >> 32 != own >> 32:
+                break
+            below += ti.cast(key < own, ti.i32)
+            begin -= 1
+        after = place + 1
+        while after < self.particles:
+            key = self.cell_key[first + after]
+            if key >> 32 != own >> 32:
+                break
+            below += ti.cast(key < own, ti.i32)
+            after += 1
+        return begin + below
+
     @ti.kernel
     def sort(
         self,
@@ -395,49 +445,67 @@ class OrderPhases(WarpPhases):
         t: ti.i32,
         stamp: ti.i32,
     ):
-        """Sort the particles of a time slot by cell, into another slot or array.
+        """Sort the particles of a time slot by block, cell and number, into another slot or array.
 
         The permutation is written for step t, and the resulting particle order to ``after``, from the
         previous order ``numbers``.
         """
-        for e in range(self.batch):
-            self.placed[e] = 0
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             if particle < self.particles:
                 base = self.cell_of(state, slot, e, particle)
-                self.rank[q] = ti.atomic_add(self.cell_count[e * self.nodes + self.linear(base)], 1)
+                node, part, row = self.counted(e, base)
+                self.cell_place[q] = ti.atomic_add(self.cell_count[node], 1)
+                ti.atomic_add(self.part_count[part], 1)
+                ti.atomic_add(self.row_count[row], 1)
                 block, _crossing = self.block_of(base)
                 self.list_block(e * self.blocks + block, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
-                # Convert the counts of a warp's cells to offsets.
-                node, lane = e * self.nodes + self.linear_in_block(block, r), w % WARP
+                node, part, row = self.counted(e, self.node_of_block(block, r))
+                # Convert the counts of a warp's cells to places, after those of earlier rows and of earlier
+                # parts of this row.
+                lane, own_row = w % WARP, row % self.rows
+                own_part = part % self.count_parts % ti.static(1 << self.row_bits)
+                before = 0
+                for k in range((own_row - lane + WARP - 1) // WARP):
+                    before += self.row_count[row - own_row + lane + k * WARP]
+                for k in range((own_part - lane + WARP - 1) // WARP):
+                    before += self.part_count[part - own_part + lane + k * WARP]
+                for k in ti.static(range(RUN_BITS)):
+                    before += ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), before, 1 << k)
                 count = self.cell_count[node]
                 upto = count
                 for k in ti.static(range(RUN_BITS)):
                     below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
                     if lane >= (1 << k):
                         upto += below
-                total = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), upto, WARP - 1)
-                begin = 0
-                if lane == 0:
-                    begin = ti.atomic_add(self.placed[e], total)
-                begin = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), begin, 0)
-                self.cell_count[node] = begin + upto - count
+                self.cell_count[node] = before + upto - count
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
-            place = particle
             if particle < self.particles:
-                base = self.cell_of(state, slot, e, particle)
-                place = self.cell_count[e * self.nodes + self.linear(base)] + self.rank[q]
-            moves[t * self.particle_threads + q - particle + place] = particle
-        for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
-                e, block, r = self.node_of(w + turn * self.node_threads)
-                self.cell_count[e * self.nodes + self.linear_in_block(block, r)] = 0
+                cell = self.linear(self.cell_of(state, slot, e, particle))
+                place = self.cell_count[e * self.nodes + cell] + self.cell_place[q]
+                self.cell_place[q] = place
+                key = (ti.cast(cell, ti.i64) << 32) | ti.cast(numbers[q], ti.i64)
+                self.cell_key[q - particle + place] = key
+        for w in range(self.particle_threads + self.node_threads):
+            if w < self.particle_threads:
+                e, particle = self.particle_of(w)
+                place = particle
+                if particle < self.particles:
+                    place = self.place_in_cell(w - particle, self.cell_place[w])
+                moves[t * self.particle_threads + w - particle + place] = particle
+            else:
+                q = w - self.particle_threads
+                for turn in range(self.turns_of(q, self.node_threads, self.nodes_in(self.block_count))):
+                    e, block, r = self.node_of(q + turn * self.node_threads)
+                    node, part, row = self.counted(e, self.node_of_block(block, r))
+                    self.cell_count[node] = 0
+                    self.part_count[part] = 0
+                    self.row_count[row] = 0
         for q in range(self.particle_threads):
             _e, place = self.particle_of(q)
             if q == 0:

@@ -125,13 +125,16 @@ class Particles:
         padding = np.arange(particles, engine.tiles * engine.lanes)
         rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)
         self._start = rows.astype(np.int32).reshape(-1)
+        # Copies within the device need not wait for it.
+        self._start_there = self.order_array(1)
+        self._start_there.from_numpy(self._start)
         self._changed = True
         self.reset_order()
 
     def reset_order(self, environments: Sequence[int] | None = None) -> None:
         """Restore the initial order of all or some environments."""
         if self._changed and environments is None:
-            copy_numbers(self.numbers, 0, self._start, self.places, 1)
+            copy_numbers(self.numbers, 0, self._start_there, self.places, 1)
             self._changed = False
         if self._changed:
             own = self.places // self.engine.batch
