@@ -41,6 +41,10 @@ def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path) -> No
         command = [sys.executable, "-c", "import zz_above, plab; print(zz_above.FOUND)"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == "2\n" and os.environ.get("PYTHONPATH") == before
+    # Environments are registered before the user's modules are imported.
+    (folder / "zz_made.py").write_text("import gymnasium\nraise OSError(gymnasium.spec('plab/Rope-v2').id)")
+    command = [sys.executable, "-m", "plab", "run", "--config-dir", str(folder), "method.family=zz_made:A"]
+    assert "OSError: plab/Rope-v2" in subprocess.run(command, capture_output=True, text=True).stderr
 
 
 def test_what_is_wrong_is_one_line(folder: Path) -> None:

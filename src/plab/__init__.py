@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -9,11 +10,14 @@ import tempfile
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if (_words := [os.path.basename(word) for word in sys.orig_argv[1:3]])[:1] == ["plab"] or (
-    _words[:1] == ["-m"] and _words[-1].partition(".")[0] == "plab"
+if _IS_COMMAND := (
+    (_words := [os.path.basename(word) for word in sys.orig_argv[1:3]])[:1] == ["plab"]
+    or (_words[:1] == ["-m"] and _words[-1].partition(".")[0] == "plab")
 ):
     # Ctrl-C ends a command without a traceback until plab.cli.command handles it.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Imports and compilation allocate many long-lived objects; frequent collection would take seconds.
+    gc.set_threshold(100_000)
 
 # Set before Taichi is imported: otherwise it prints a banner on standard output, and sends version, platform
 # and an id to its developers.
@@ -25,10 +29,10 @@ if os.name == "posix" and "HOME" not in os.environ:
     os.environ["HOME"] = next(filter(os.path.isdir, (os.path.expanduser("~"), tempfile.gettempdir())))
 
 from plab.config.suite import suite_tasks
-from plab.envs import make, make_vec, register_suite
 
 if TYPE_CHECKING:
     from plab.config import build_scene, load_config
+    from plab.envs import make, make_vec
     from plab.problem import make_simulator
     from plab.results import load as load_results
     from plab.scenes import Scene
@@ -58,11 +62,15 @@ _PLACES = {
     "build_scene": ("plab.config", "build_scene"),
     "load_config": ("plab.config", "load_config"),
     "load_results": ("plab.results", "load"),
+    "make": ("plab.envs", "make"),
+    "make_vec": ("plab.envs", "make_vec"),
     "make_simulator": ("plab.problem", "make_simulator"),
 }
 """Module and name of each part that is imported on first use: Taichi and pandas take seconds."""
 
-register_suite()
+if not _IS_COMMAND:
+    # Registers the environments; commands do without Gymnasium, which takes a tenth of a second.
+    import_module("plab.envs")
 
 
 def __getattr__(name: str) -> Any:

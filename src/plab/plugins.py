@@ -101,6 +101,9 @@ def load_object(text: str, kind: type[Kind]) -> Kind:
 
 
 def _imported(text: str, name: str) -> ModuleType:
+    if name.partition(".")[0] != "plab":
+        # Registers plab's environments, which the module may create.
+        import_module("plab.envs")
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

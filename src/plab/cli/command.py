@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import functools
-import gc
 import inspect
 import io
 import json
@@ -55,8 +54,6 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
 
     @functools.wraps(main)
     def answered(argv: Sequence[str] | None = None) -> int:
-        # Compilation allocates many long-lived objects; frequent garbage collection would take seconds.
-        gc.set_threshold(100_000)
         if threading.current_thread() is threading.main_thread():
             # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
             signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -64,3 +64,6 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
         # not revisions, so the number is part of the name.
         spec = gymnasium.registry[env_id]
         spec.name, spec.version = f"{task}-v{variant}", None
+
+
+register_suite()

@@ -14,12 +14,54 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
+from textwrap import dedent, fill
+from types import SimpleNamespace
 from typing import Any
 
 QUADRANTS = os.environ.get("PLAB_COMPILER") == "quadrants" or find_spec("taichi") is None
 """True if kernels are compiled by Quadrants: Taichi is missing, or PLAB_COMPILER=quadrants."""
+
+
+def _skip_source_search(module: Any) -> None:
+    """Detect methods in Taichi's decorators without searching for sources: patches
+    ``kernel_impl._inside_class``.
+
+    For each function, Taichi calls ``inspect`` for the source of the importing module, which searches all
+    modules every time and takes half of the import of Taichi and a quarter of the simulator's.
+    """
+    tell = module._inside_class
+
+    @functools.wraps(tell)
+    def inside_class(level_of_class_stackframe: int) -> bool:
+        # The frame below the one that Taichi inspects is a class body or not.
+        if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
+            return False
+        return bool(tell(level_of_class_stackframe + 1))
+
+    module._inside_class = inside_class
+
+
+class _PatchingFinder:
+    """Import hook that patches Taichi's decorators before Taichi defines its own functions."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any, target: Any = None) -> Any:
+        """Return the module's spec, with the patch after its execution."""
+        if name != "taichi.lang.kernel_impl":
+            return None
+        spec: Any = PathFinder.find_spec(name, path, target)
+        execute = spec.loader.exec_module
+
+        def execute_patched(module: Any) -> None:
+            execute(module)
+            _skip_source_search(module)
+
+        spec.loader.exec_module = execute_patched
+        return spec
+
 
 if QUADRANTS:
     import quadrants as ti
@@ -31,6 +73,8 @@ if QUADRANTS:
     _TRACE = "get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.mem_fence
 else:
+    # No effect if Taichi is already imported.
+    sys.meta_path.insert(0, _PatchingFinder)
     import taichi as ti
     from taichi._snode.fields_builder import FieldsBuilder
     from taichi.lang import _ndarray, impl
@@ -39,6 +83,7 @@ else:
     from taichi.lang.kernel_impl import Kernel
     from taichi.lang.source_builder import SourceBuilder
 
+    sys.meta_path.remove(_PatchingFinder)
     _TRACE = "_get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.memfence
 
@@ -46,27 +91,21 @@ else:
 # -- definitions of kernels ---------------------------------------------------------------------------------
 
 
-def _skip_source_search() -> None:
-    """Detect methods in Taichi's decorators without searching for sources: patches
-    ``kernel_impl._inside_class``.
+def _read_sources_once() -> None:
+    """Read the source of each function once: patches ``getsourcelines``, ``getsourcefile`` and ``textwrap``
+    of ``kernel_impl``.
 
-    For each function, Taichi calls ``inspect`` for the source of the importing module, which searches all
-    modules every time and takes a quarter of the simulator's import.
+    Taichi reads and tokenises it for every call in a kernel, a quarter of the time with a warm cache.
     """
-    tell = _traced._inside_class
-
-    @functools.wraps(tell)
-    def inside_class(level_of_class_stackframe: int) -> bool:
-        # The frame below the one that Taichi inspects is a class body or not.
-        if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
-            return False
-        return bool(tell(level_of_class_stackframe + 1))
-
-    _traced._inside_class = inside_class
+    for name in ("getsourcelines", "getsourcefile"):
+        setattr(_traced, name, functools.lru_cache(maxsize=1000)(getattr(_traced, name)))
+    _traced.textwrap = SimpleNamespace(fill=functools.cache(fill), dedent=functools.cache(dedent))
 
 
 if not QUADRANTS:
-    _skip_source_search()
+    if not hasattr(_traced._inside_class, "__wrapped__"):
+        _skip_source_search(_traced)
+    _read_sources_once()
 
 
 # -- compiling ----------------------------------------------------------------------------------------------

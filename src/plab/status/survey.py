@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-import pandas as pd
-
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.errors import printable
+from plab.plugins import pandas as pd
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
 from plab.results.run_table import rows
