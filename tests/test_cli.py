@@ -67,7 +67,7 @@ def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_p
 
 def test_sweeps_over_groups_with_keys_that_the_default_has_not(seen):
     assert main(["-m", "task=Move", "method=sac,ppo", "method.episodes=2"]) == 0
-    assert main(["-m", "method=cem,cmaes", "method.population=70"]) == 0
+    assert main(["-m", "method=cem,cmaes", "method.population=4"]) == 0
     assert main(["-m", "method=sac,td3", "method.tau=0.01"]) == 0
     assert [cfg.method.name for cfg in seen] == ["sac", "ppo", "cem", "cmaes", "sac", "td3"]
     assert [cfg.method.episodes for cfg in seen[:2]] == [2, 2] and seen[4].method.tau == 0.01

@@ -221,7 +221,7 @@ RANGES: dict[str, tuple[list[Any], list[Any], str]] = {
     "method.curve": (["spline"], ["constant", "linear"], "cem.curve"),
     "method.objective": (["reward"], ["loss", "final", "score"], "cem.objective"),
     "method.population": ([3], [4], "mppi.population"),
-    "method.elites": ([1, 65], [2, 64], "cem.elites"),
+    "method.elites": ([1], [2, 65], "cem.elites"),
     "method.lrs": ([[], [0.1, 0.0]], [[0.1]], "multistart.lrs"),
     "method.buffer_size": ([0], [1], "sac.buffer_size"),
     "method.gradient_steps": ([0, -2], [-1, 1], "sac.gradient_steps"),

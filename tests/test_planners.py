@@ -91,14 +91,15 @@ def drawn(mean: torch.Tensor, std: torch.Tensor | float, iteration: int, best: t
     return points
 
 
-def test_cem_fits_mean_and_spread_to_the_elites() -> None:
-    settings = ("elites=2", "smoothing=0.1", "least_spread=0.3", "spread=0.5")
+@pytest.mark.parametrize(("elites", "fitted"), [(2, 2), (5, 5), (6, 2)])
+def test_cem_fits_mean_and_spread_to_the_elites(elites: int, fitted: int) -> None:
+    settings = (f"elites={elites}", "smoothing=0.1", "least_spread=0.3", "spread=0.5")
     search = make_planner(rule("cem", *settings), START)
     first, second, third = (iterate(search, i)[0][0].actions for i in range(3))
     torch.testing.assert_close(first, 0.3 * uniform(random(0), 5))
     torch.testing.assert_close(second, drawn(best_of(first), 0.5, 1, best_of(first)))
-    elites = second[costs(second).argsort()[:2]]
-    mean, std = 0.9 * elites.mean(0) + 0.1 * best_of(first), 0.9 * elites.std(0).clamp(min=0.3) + 0.1 * 0.5
+    best = second[costs(second).argsort()[:fitted]]
+    mean, std = 0.9 * best.mean(0) + 0.1 * best_of(first), 0.9 * best.std(0).clamp(min=0.3) + 0.1 * 0.5
     torch.testing.assert_close(third, drawn(mean, std, 2, best_of(second)))
 
 

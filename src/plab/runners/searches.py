@@ -226,7 +226,8 @@ class CemConfig(SamplerConfig):
     """Cross-entropy method.
 
     Attributes:
-        elites: Number of candidates that determine mean and standard deviation.
+        elites: Number of candidates that determine mean and standard deviation; half of the population if
+            that is smaller.
         smoothing: Weight of the old mean and standard deviation.
         least_spread: Lower bound of the standard deviation.
     """
@@ -235,12 +236,12 @@ class CemConfig(SamplerConfig):
     smoothing: float = field(metadata=ranges.FRACTION)
     least_spread: float = field(metadata=ranges.FINITE)
 
-    def check(self, path: str) -> None:
-        super().check(path)
+    @property
+    def fitted(self) -> int:
+        """Number of candidates that count."""
         if self.elites > self.population:
-            raise ConfigError(
-                f"{path}.elites must be at most population = {self.population}, not {self.elites}"
-            )
+            return self.population // 2
+        return self.elites
 
 
 class Cem(Sampler):
@@ -255,7 +256,7 @@ class Cem(Sampler):
         return self.memory["mean"] + self.memory["std"] * self.noise(random)
 
     def learn(self, points: Tensor, cost: Tensor) -> None:
-        elites = points[cost.argsort(stable=True)[: self.method.elites]]
+        elites = points[cost.argsort(stable=True)[: self.method.fitted]]
         mean, std = elites.mean(0), elites.std(0).clamp(min=self.method.least_spread)
         self.memory["mean"] = torch.lerp(mean, self.memory["mean"], self.method.smoothing)
         self.memory["std"] = torch.lerp(std, self.memory["std"], self.method.smoothing)
