@@ -92,9 +92,6 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
         assert np.all(distance(centers + 0.005 * faces["Normals"]) > distance(centers))
 
 
-# ------------------------------------------------------------------------------------------------- plasticine
-
-
 @pytest.mark.parametrize("body", [CUBE, BALL], ids=["box", "sphere"])
 def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(body):
     x = sample_particles(scene(bodies=(body,)))
@@ -113,9 +110,6 @@ def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(
     target = shapes.target_mesh(scene(), box_mass(np.array([0.5, 0.4, 0.5])))
     assert target.volume == pytest.approx(0.2**3, rel=0.15)
     assert target.center_of_mass() == pytest.approx([0.5, 0.4, 0.5], abs=0.01)
-
-
-# ----------------------------------------------------------------------------------------------------- camera
 
 
 @pytest.mark.parametrize("view", [*VIEWS.values(), View(-130.0, 5.0)])

@@ -33,9 +33,10 @@ METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
 LOSS = ROOT / "examples" / "own_loss"
 
-# Run in a copy of plab that has the disc: gradients must be what differences are.
+# Run in a copy of plab that has the disc: gradients must be what differences are, the picture as large.
 DISC = """
 from plab.losses import check_gradient, make_terms
+from plab.render.shapes import manipulator_parts
 from plab.scenes import Body, Manipulator, Scene
 
 tool = Manipulator("Disc", (0.06, 0.03), (0.5, 0.235, 0.5), scale=(0.02,) * 3 + (0.2,) * 3)
@@ -43,6 +44,7 @@ body = Body("box", (0.5, 0.1, 0.5), (0.2, 0.2, 0.2), 200)
 scene = Scene("disc", (body,), (tool,), grid_size=16, substeps=5, dt=4e-4, horizon=4)
 errors = check_gradient(make_terms({"contact": 1.0}, {"contact": "soft"})[0], [scene])
 assert max(errors.values()) < 1e-6, errors
+assert abs(manipulator_parts(tool)[0].mesh.points).max(axis=0).round(6).tolist() == [0.09, 0.03, 0.09]
 """
 
 

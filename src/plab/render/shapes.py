@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import pyvista as pv
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from plab.scenes import Body, Manipulator, Scene
+from plab.scenes import Body, Manipulator, Scene, SceneError
 
 KERNEL_WIDTH = 1.5
 """Standard deviation of the kernel that smooths particles [mean particle spacings]."""
@@ -47,26 +48,44 @@ class Part:
 
 
 def manipulator_parts(manipulator: Manipulator) -> list[Part]:
-    """Return the parts of a manipulator."""
+    """Return the parts of a manipulator: the convex body of :attr:`ManipulatorShape.support`, or its own
+    mesh."""
     meshes: dict[str, Callable[..., pv.PolyData]] = {
-        "Box": lambda x, y, z: pv.Box((-x, x, -y, y, -z, z)),
-        "Sphere": lambda radius: pv.Sphere(radius=radius, theta_resolution=_AROUND, phi_resolution=_ARC),
-        "Capsule": _capsule,
         "Chopsticks": lambda length, radius: _capsule(length, radius).translate((0.0, -length / 2, 0.0)),
         "Torus": lambda major, minor: pv.ParametricTorus(
             major, minor, u_res=_AROUND + 1, v_res=_ARC + 1
         ).rotate_x(90.0),
-        "Cylinder": lambda radius, half: pv.Cylinder(
-            direction=(0.0, 1.0, 0.0), radius=radius, height=2 * half, resolution=_AROUND
-        ),
     }
-    mesh = meshes[manipulator.outline](*manipulator.size).clean()
-    mesh = mesh.compute_normals(feature_angle=40.0, split_vertices=True)
+    own = meshes.get(manipulator.outline)
+    mesh = own(*manipulator.size) if own else _hull(manipulator)
+    mesh = mesh.clean().compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=True)
     return [Part(mesh, side) for side in ((-0.5, 0.5) if manipulator.kind.grips else (0.0,))]
 
 
 def _capsule(length: float, radius: float) -> pv.PolyData:
     return pv.Capsule(direction=(0.0, 1.0, 0.0), cylinder_length=length, radius=radius, resolution=_AROUND)
+
+
+def _hull(manipulator: Manipulator) -> pv.PolyData:
+    """Return the convex body with a manipulator's support, whose gradient is the farthest point."""
+    support = manipulator.kind.support
+    if support is None:
+        raise SceneError(f"{manipulator.shape} has no support, from which its picture is made")
+
+    def extent(directions: np.ndarray) -> np.ndarray:
+        lengths = np.linalg.norm(directions, axis=0)
+        return lengths * support(manipulator.size, directions / lengths)
+
+    polar, around = np.meshgrid(
+        np.linspace(0.0, np.pi, _ARC + 1), np.arange(_AROUND) * (2 * np.pi / _AROUND), indexing="ij"
+    )
+    ring = np.sin(polar)
+    ways = np.stack([ring * np.cos(around), np.cos(polar), ring * np.sin(around)]).reshape(3, -1)
+    steps = 1e-6 * np.eye(3)[..., None]
+    farthest = np.stack([(extent(ways + h) - extent(ways - h)) / 2e-6 for h in steps], axis=-1)
+    # Equal up to rounding are the points of a corner.
+    points = np.unique(farthest.round(8), axis=0)
+    return pv.PolyData.from_regular_faces(points, ConvexHull(points).simplices)
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:

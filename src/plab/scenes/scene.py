@@ -245,15 +245,16 @@ class ManipulatorShape:
             ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
         outline: Shape with the same surface; default: this shape.
-        support: Distance from the position to the farthest point in a direction, as a function of the sizes
-            and a unit vector [3] in the manipulator's frame; None for shapes that grip between their parts.
+        support: Distance from the position to the farthest point along directions, as a function of the
+            sizes and unit vectors in the manipulator's frame, shape [3] or [3, number]; None for shapes that
+            grip between their parts.
     """
 
     size_names: tuple[str, ...]
     motion: str
     action_names: tuple[str, ...]
     outline: str = ""
-    support: Callable[[Sequence[float], np.ndarray], float] | None = None
+    support: Callable[[Sequence[float], np.ndarray], Any] | None = None
 
     @property
     def moves(self) -> bool:
@@ -280,7 +281,7 @@ _XYZ = ("x", "y", "z")
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 
 
-def _capsule_support(size: Sequence[float], d: np.ndarray) -> float:
+def _capsule_support(size: Sequence[float], d: np.ndarray) -> Any:
     return 0.5 * size[0] * abs(d[1]) + size[1]
 
 
@@ -304,7 +305,7 @@ MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
         ("half_x", "half_y", "half_z"),
         "rigid",
         (*_XYZ, *_ROTATION),
-        support=lambda size, d: float(np.abs(d) @ np.asarray(size)),
+        support=lambda size, d: np.abs(d).T @ np.asarray(size),
     ),
 }
 """The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
