@@ -33,7 +33,7 @@ SCENES = [
 ]
 STRAINS = (0.02, 0.6)
 
-PARTS = 3  # CUDA's warps for 32 particles
+PARTS = 4  # CUDA's warps for 32 particles
 
 ARRAY = ti.types.ndarray(ndim=1)
 
@@ -129,7 +129,7 @@ class Threads(CudaPhases):
     @ti.kernel
     def gather_adjoint_all(self, state: ARRAY, bar: ARRAY):
         for q in range(PARTS * self.batch * self.tiles * self.lanes):
-            self.gather_thread_adjoint(state, bar, 0, 1, q, PARTS)
+            self.gather_thread_adjoint(state, bar, 0, 1, q, 0, PARTS)
         for row in range(self.batch * self.materials):
             self.take_material(row)
 
