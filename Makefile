@@ -32,7 +32,7 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-# A file of tests stays in one process, which compiles its kernels once; files start in the order of tests/conftest.py.
+# Files that simulate the same task stay in one process, which compiles kernels once: tests/conftest.py.
 # A test that hangs is ended after 15 minutes.
 PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 

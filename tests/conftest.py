@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,10 +27,13 @@ os.environ["PLAB_TRACEBACK"] = "1"
 OF_ANY_DEVICE = ("tests/test_simulator.py", "tests/test_mixed_materials.py", "tests/verification/")
 """Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
-FIRST = """manipulators losses simulator protocol kernel_pairs kinematics mixed_laws mixed_materials laws
-trajectory autograd free_bodies runtime rl tutorials planners wrappers envs""".split()
-"""Files that start first: those in float64 or with more threads, which invalidate the simulators of all other
-tests, then the longest."""
+MOVE = "rl envs wrappers actors planners tutorials cameras datasets demonstrations mpc draws render".split()
+ROPE = "autograd trajectory sweep_simulated".split()
+"""Files whose simulators are of the same kinds, of the tasks Move and Rope, the latter in float64."""
+
+FIRST = """manipulators protocol kernel_pairs simulator losses kinematics laws mixed_laws mixed_materials
+free_bodies runtime""".split()
+"""Files that start after those: in float64 or with more threads, which invalidates all other simulators."""
 
 
 @pytest.fixture(scope="session")
@@ -143,9 +147,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if DEVICE == "cuda" and item.nodeid.startswith(OF_ANY_DEVICE):
             item.add_marker("gpu")
-    order = {f"test_{name}": number for number, name in enumerate(FIRST)}
+    order = {f"test_{name}": number for number, name in enumerate([*MOVE, *ROPE, *FIRST])}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_devices():
         for item in needing:
             item.add_marker(pytest.mark.skip(reason="no usable CUDA device"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keep files in one process, and those of the same task."""
+    from xdist.scheduler import LoadFileScheduling
+
+    made, group = (
+        LoadFileScheduling(config, log),
+        {name: group[0] for group in (MOVE, ROPE) for name in group},
+    )
+    made._split_scope = lambda node: group.get(file := node.split("::")[0][len("tests/test_") : -3], file)
+    return made

@@ -15,15 +15,29 @@ import pandas as pd
 import pytest
 
 from plab.config import Config
+from plab.losses import make_terms
 from plab.problem import build_scenes, make_simulator
 from plab.results import RunResult, read
 from plab.results.running import RunFile
-from plab.runners.runner import simulator_key
+from plab.runners import run_config
+from plab.runners.runner import SimulatorCache, simulator_key
 from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator
 
 TIMES = ["seconds"]
 """Columns in which two identical runs differ."""
+
+
+CACHE = SimulatorCache()
+"""Simulators of the runs of one module."""
+
+
+def run(cfg: Config) -> RunResult:
+    """Run a configuration; return its finished file."""
+    score = run_config(cfg, CACHE)
+    result = read(cfg.path)
+    assert result.status == "finished" and result.evaluation["score"] == score
+    return result
 
 
 def assert_same_numbers(got: RunResult, want: RunResult) -> None:
@@ -78,10 +92,14 @@ def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options
     """Return a simulator as :func:`plab.problem.make_simulator` does, reusing one that nobody refers to."""
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
     scenes = build_scenes(cfgs) if scenes is None else scenes
-    alike = replace(cfgs[0], sim=replace(cfgs[0].sim, memory_mb=0.0))
-    given = {name: value for name, value in options.items() if value}
-    terms = [(type(term), term.name, term.weight) for term in given.pop("terms", ())]
-    key = len(cfgs), simulator_key(alike, scenes[0]), repr((terms, given))
+    first = cfgs[0]
+    method = replace(first.method, loss_weights={}, loss_terms={})
+    alike = replace(first, sim=replace(first.sim, memory_mb=0.0), method=method)
+    given = {name: value for name, value in options.items() if value and name != "terms"}
+    asked = options.get("terms", make_terms(first.method.loss_weights, first.method.loss_terms))
+    terms = [term for term in asked if term.weighted and term.weight]
+    kinds = [(type(term), term.name) for term in terms], len(asked)
+    key = len(cfgs), simulator_key(alike, scenes[0]), repr((kinds, given))
     same = [simulator for known, simulator in SIMULATORS if known == key]
     for collect in (bool, gc.collect) if same else ():
         collect()
@@ -93,7 +111,7 @@ def shared_simulator(cfgs: Any, scenes: Sequence[Scene] | None = None, **options
                     simulator._start_from([sample_particles(scene) for scene in scenes])
                     simulator.memory_mb = cfgs[0].sim.memory_mb
                     simulator.set_contact("soft")
-                    simulator.set_weights({term.name: term.weight for term in simulator.terms})
+                    simulator.set_weights({term.name: term.weight for term in terms})
                     SIMULATORS.sort(key=lambda entry: entry[1] is simulator)
                     return simulator
     SIMULATORS[:] = [*SIMULATORS[-23:], (key, make_simulator(cfgs, scenes, **options))]

@@ -17,11 +17,10 @@ from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.pods import PodsRunner
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.runner import SimulatorCache
 from plab.runners.shac import td_lambda
 from plab.runners.training import DEVIATION_MIN, shared_batches, training_scenes
 from plab.scenes import SceneError
-from same_runs import finished_as, stopped_at
+from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
 
 HORIZON = 5
@@ -38,7 +37,6 @@ METHODS = {
         *("method.updates=3", "method.action_lr=0.05", "method.epochs=2", "method.batch_size=4"),
     ),
 }
-CACHE = SimulatorCache()
 
 
 def make_config(folder: Path | str, name: str = "shac", *overrides: str) -> Config:
@@ -55,11 +53,6 @@ def prepared(cfg: Config) -> PodsRunner:
     runner = PodsRunner([SimpleNamespace(cfg=cfg)], "", CACHE)
     runner.prepare(environments(cfg)[0])
     return runner
-
-
-def run(cfg: Config) -> RunResult:
-    run_config(cfg, CACHE)
-    return read(cfg.path)
 
 
 @pytest.fixture(scope="module", params=METHODS)

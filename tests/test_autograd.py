@@ -21,10 +21,10 @@ HORIZON = 3
 
 @pytest.fixture(scope="module")
 def episodes() -> EpisodeBatch:
-    """Two environments, the second with a softer rope; the target is observed."""
+    """Four environments, the second with a softer rope; the target is observed."""
     first = load_config([*COARSE_ROPE, "observe_target=true"])
     second = load_config([*COARSE_ROPE, "observe_target=true", "task.yield_stress=20"])
-    return EpisodeBatch([first, second], contact="soft")
+    return EpisodeBatch([first, second, first, first], contact="soft")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def problem(episodes: EpisodeBatch) -> Problem:
 
 def draw(seed: int, **options) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    unit = torch.rand((2, HORIZON, 6), generator=generator, dtype=torch.float64)
+    unit = torch.rand((4, HORIZON, 6), generator=generator, dtype=torch.float64)
     return (1.6 * unit - 0.8).to(**options).requires_grad_()
 
 
@@ -46,7 +46,7 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
     np.testing.assert_array_equal(losses.detach().numpy(), expected.loss.sum(axis=1))
     np.testing.assert_array_equal(actions.grad.numpy(), expected.gradient)
     # Each environment's loss is weighed on its own, and there is no second derivative.
-    whole, weights = actions.grad.clone(), torch.tensor([0.0, 3.0], dtype=torch.float64)
+    whole, weights = actions.grad.clone(), torch.tensor([0.0, 3.0, 0.0, 0.0], dtype=torch.float64)
     (weighed,) = torch.autograd.grad(rollout(problem, actions) @ weights, actions)
     assert torch.count_nonzero(weighed[0]) == 0
     torch.testing.assert_close(weighed[1], 3.0 * whole[1])
@@ -89,7 +89,7 @@ def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBat
         assert got.info.keys() == want.info.keys()
         assert got.truncated.all() == want.truncated.all() == (t == HORIZON - 1)
     env.reset()
-    assert env.step(torch.ones((2, 6), dtype=torch.int32)).reward.dtype == torch.float64
+    assert env.step(torch.ones((4, 6), dtype=torch.int32)).reward.dtype == torch.float64
 
 
 def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem) -> None:
@@ -185,5 +185,5 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
         episodes.problem.evaluate_actions(actions, gradient=True).gradient, before.gradient
     )
     episodes.reset()
-    with pytest.raises(ValueError, match=r"\(2, 5\)"):
+    with pytest.raises(ValueError, match=r"\(4, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)

@@ -12,16 +12,13 @@ import plab
 from plab.cli.dataset import main
 from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
-from plab.results import read
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.runner import SimulatorCache
-from same_runs import finished_as, stopped_at
+from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
 
 COARSE = ("observe_particles=5", "observe_target=true", *COARSE_32, "progress=false")
 SEARCH = ("method=cem", "method.population=4", "method.elites=2", "method.iterations=2")
-CACHE = SimulatorCache()
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +89,7 @@ def cloned(folder: Path, *words: str) -> Config:
 
 def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path) -> None:
     cfg = cloned(written, f"results_dir={tmp_path}/a")
-    run_config(cfg, CACHE)
-    whole = read(cfg.path)
+    whole = run(cfg)
     errors = whole.columns["imitation_error"]
     assert np.isnan(errors[0]) and errors[2] < errors[1] and whole.provenance["dataset_rows"] == 150
     policy, (episode, *_) = load_policy(cfg.path), read_episodes(written / "plab/Move-v0")
@@ -115,8 +111,7 @@ def test_parameters_are_found_from_observed_particles(tmp_path: Path) -> None:
     fit = ["method=identify", f"method.dataset={tmp_path}/plab/Torus-v0", "task.yield_stress=100"]
     fit += ["method.parameters=[yield_stress,gravity]", "method.iterations=8", "checkpoint_seconds=0"]
     cfg, again = (load_config([*words, *fit, f"results_dir={tmp_path}/{name}"]) for name in "ab")
-    run_config(cfg, CACHE)
-    result = read(cfg.path)
+    result = run(cfg)
     rows, last = result.iterations, result.iterations.iloc[-1]
     assert last["yield_stress"] == pytest.approx(50.0, rel=0.1)
     assert last["gravity"] == pytest.approx(30.0, rel=0.1)

@@ -14,9 +14,8 @@ from faults import DEATH, Death, Failing, contents, watched
 from plab.config import Config, load_config
 from plab.results import read
 from plab.runners import run_batch
-from plab.runners.runner import SimulatorCache
+from same_runs import CACHE
 
-CACHE = SimulatorCache()
 TD3 = """
 method=td3 method.episodes=12 method.num_envs=2 method.evaluate_every=4 method.hidden=[8] method.batch_size=8
 method.learning_starts=8 method.buffer_size=16 task=Move sim.grid_size=32 sim.horizon=4 sim.substeps=5

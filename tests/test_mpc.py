@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from plab.config import Config, ConfigError, load_config
-from plab.results import read
 from plab.runners import run_config
-from plab.runners.runner import SimulatorCache
-from same_runs import finished_as, stopped_at
+from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
 
 COARSE = (
@@ -20,7 +18,6 @@ COARSE = (
     "checkpoint_seconds=0", "progress=false",
 )  # fmt: skip
 CEM = ("method.planner.population=4", "method.planner.elites=2")
-CACHE = SimulatorCache()
 
 
 def config(folder: Path | str, *words: str) -> Config:
@@ -30,8 +27,7 @@ def config(folder: Path | str, *words: str) -> Config:
 @pytest.mark.parametrize("words", [CEM, ("method@method.planner=adam",)], ids=["cem", "adam"])
 def test_what_is_executed_is_what_is_judged_and_resumes(words: tuple[str, ...], tmp_path: Path) -> None:
     cfg = config(tmp_path / "a", *words)
-    run_config(cfg, CACHE)
-    result = read(cfg.path)
+    result = run(cfg)
     last = result.iterations.iloc[-1]
     assert result.rows == 3 and result.best_iteration == 2 and np.abs(result.best_actions).max() > 0
     for name in ("loss", "loss_density", "reward", "score"):
@@ -42,7 +38,7 @@ def test_what_is_executed_is_what_is_judged_and_resumes(words: tuple[str, ...], 
     again = config(tmp_path / "b", *words)
     with stopped_at(2):
         run_config(again, CACHE)
-    run_config(again, CACHE)
+    run(again)
     finished_as(again, result)
 
 

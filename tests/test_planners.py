@@ -21,11 +21,10 @@ from plab.results.checking import faults
 from plab.runners import RunError, Step, Track, planner, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
 from plab.runners.planner import Answer, CandidateStart, Request, make_planner
-from plab.runners.runner import SimulatorCache
 from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
 from plab.sweep.execution import plan
-from same_runs import assert_same_numbers
+from same_runs import CACHE, assert_same_numbers, run
 from toy_runner import COARSE_32
 
 # ---------------------------------------------------------------- rules, on a quadratic loss
@@ -240,16 +239,9 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 OTHER = ("variant=3", "seed=2", "task.yield_stress=20")
 
-CACHE = SimulatorCache()
-
 
 def make_config(folder: Path, method: str, *overrides: str) -> Config:
     return load_config([*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides])
-
-
-def run(cfg: Config) -> RunResult:
-    run_config(cfg, CACHE)
-    return read(cfg.path)
 
 
 @pytest.fixture(scope="module")

@@ -26,17 +26,14 @@ from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, run_batch, run_config, sb3, training
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path
 from plab.runners.rl import RlRunner, agents_of
-from plab.runners.runner import Outcome, SimulatorCache, episode_columns
+from plab.runners.runner import Outcome, episode_columns
 from plab.runners.sb3 import Sb3Runner
 from plab.runners.training import evaluate, shared_batches
-from same_runs import finished_as, stopped_at
+from same_runs import CACHE, finished_as, run, stopped_at
 from suite import make_not_finite
 from toy_runner import COARSE_32
 
-CACHE = SimulatorCache()
-
 HORIZON = 4
-
 COARSE = (
     "task=Move",
     *COARSE_32,
@@ -82,13 +79,6 @@ def make_config(folder: Path, method: str, *overrides: str) -> Config:
 
 def configs(folder: Path, method: str, *overrides: str) -> list[Config]:
     return [make_config(folder, method, *overrides, *own) for own in RUNS]
-
-
-def run(cfg: Config) -> RunResult:
-    score = run_config(cfg, CACHE)
-    result = read(cfg.path)
-    assert result.status == "finished" and result.evaluation["score"] == score
-    return result
 
 
 def carry(cfgs: list[Config]) -> list[Outcome]:

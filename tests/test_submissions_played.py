@@ -94,19 +94,19 @@ def test_steps_of_episodes_that_were_left_count_and_actions_are_clipped(
 
 
 def test_many_environments_in_one_simulator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    own = [["variant=1"], ["variant=1"], ["variant=2"], ["variant=1"]]
+    own = [["variant=1"], ["variant=1"], ["variant=2"], ["variant=1"], ["variant=2"]]
     overrides = list(COARSE)
-    envs = gymnasium.make_vec("plab/RollingPin-v1", num_envs=4, overrides=overrides, overrides_per_env=own)
+    envs = gymnasium.make_vec("plab/RollingPin-v1", num_envs=5, overrides=overrides, overrides_per_env=own)
     envs = record(envs, tmp_path)
     # Only the steps of randomised episodes count.
     for options in ({"yield_stress": 30.0}, None):
         envs.reset(options=options)
-        for actions in PLANS[[0, 1, 2, 0]].swapaxes(0, 1):
+        for actions in PLANS[[0, 1, 2, 0, 2]].swapaxes(0, 1):
             infos = envs.step(actions)[4]
     assert capsys.readouterr().err.count("randomised episodes") == 1
     scores = infos["score"]
     (one,), (two,) = (read(tmp_path / f"RollingPin-v{v}.plabsub.zip").entries for v in "12")
-    assert (one.steps, one.score, two.steps, two.score) == (36, scores[1], 12, scores[2])
+    assert (one.steps, one.score, two.steps, two.score) == (36, scores[1], 24, scores[2])
     assert np.array_equal(one.actions, PLANS[1]) and np.array_equal(two.actions, PLANS[2])
 
 
@@ -229,14 +229,14 @@ def test_a_policy_is_run_only_if_asked(
     tmp_path: Path, env: gymnasium.Env, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Of five variants and ten unseen ones.
-    monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2"))
+    monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2", "3"))
     monkeypatch.setattr("plab.cli.submissions.UNSEEN", UNSEEN[:2])
     file = tmp_path / "a.pt"
     torchscript(file, Acting(env.observation_space.shape[0]))
     made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
     entries = read(made).entries
-    assert [e.configuration.variant for e in entries] == ["1", "2", *UNSEEN[:2]]
-    assert len({e.checksum for e in entries}) == 4 and {e.steps for e in entries} == {60}
+    assert [e.configuration.variant for e in entries] == ["1", "2", "3", *UNSEEN[:2]]
+    assert len({e.checksum for e in entries}) == 5 and {e.steps for e in entries} == {60}
     assert max(e.score for e in entries) > 0
     assert verify([str(made), *COARSE]) == 1
     (line,) = capsys.readouterr().err.splitlines()

@@ -12,13 +12,10 @@ import pytest
 from plab.config import Config, ConfigError, load_config
 from plab.problem import Problem
 from plab.results import RunResult, check, read
-from plab.runners import run_batch, run_config
-from plab.runners.runner import SimulatorCache
+from plab.runners import run_batch
 from plab.sweep.execution import plan
-from same_runs import finished_as, stopped_at
-from toy_runner import COARSE
-
-CACHE = SimulatorCache()
+from same_runs import CACHE, finished_as, run, stopped_at
+from toy_runner import COARSE_ROPE as COARSE
 
 RUNS = (
     ("variant=1",),
@@ -37,10 +34,7 @@ def configs(folder: Path) -> list[Config]:
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> list[RunResult]:
     """Results of each run executed alone."""
-    cfgs = configs(tmp_path_factory.mktemp("alone"))
-    for cfg in cfgs:
-        run_config(cfg, CACHE)
-    return [read(cfg.path) for cfg in cfgs]
+    return [run(cfg) for cfg in configs(tmp_path_factory.mktemp("alone"))]
 
 
 def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, alone, capsys) -> None:

@@ -23,25 +23,15 @@ from plab.runners.runner import RunLog, SimulatorCache, measures, shared_problem
 from plab.runners.training import shared_batches
 from plab.runners.trajectory import UpdateRule
 from plab.sim import SimulationError, Simulator
-from same_runs import assert_same_numbers, finished_as, stopped_at
+from same_runs import CACHE, assert_same_numbers, finished_as, run, stopped_at
 from toy_runner import COARSE_ROPE
 
-CACHE = SimulatorCache()
-
 ITERATIONS = 4
-
 COARSE = (*COARSE_ROPE, f"method.iterations={ITERATIONS}", "progress=false")
 
 
 def make_config(folder: Path, *overrides: str) -> Config:
     return load_config([*COARSE, f"results_dir={folder}", *overrides])
-
-
-def run(cfg: Config) -> RunResult:
-    score = run_config(cfg, CACHE)
-    result = read(cfg.path)
-    assert result.status == "finished" and result.evaluation["score"] == score
-    return result
 
 
 @pytest.fixture(scope="module")

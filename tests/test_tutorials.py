@@ -16,6 +16,7 @@ import pytest
 
 import plab
 import synthetic
+from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.objective import target_sdf
 from plab.results import RunResult, load, read
@@ -83,11 +84,17 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 FEWER = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
-"""Four environments instead of many."""
+MOVE = [("plab/Rope-v1", "plab/Move-v1"), ("task=Rope", "task=Move"), ("rope", "ball")]
+TERMS = ('{"contact": 1.0}', '{"density": 10.0, "sdf": 10.0, "contact": 1.0}')
+"""Four environments instead of many; one task in all pages, with the terms of all tasks."""
+
+QUICK = [("=0.05", "=0.03"), TERMS]
+# Closed environments leave their simulators to others.
+README = [*FEWER[:1], MOVE[0], ("cfg = plab", "envs.close()\ncfg = plab"), TERMS]
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize(("page", "other"), [("index.md", [("=0.05", "=0.03")]), ("../README.md", FEWER[:1])])
+@pytest.mark.parametrize(("page", "other"), [("index.md", QUICK), ("../README.md", README)])
 def test_quick_start_and_readme(page, other):
     names = run_page(page, *other)
     assert names["result"].gradient.shape == (4, 10, 6)
@@ -113,10 +120,9 @@ def test_environments():
     """Run the page with one update of the agent."""
     fewer = [*FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200")]
     fewer += [("num_envs=2", "num_envs=4"), ("[0.0, 0.1]}", "[0.0, 0.1] * 2}")]
-    # Closed environments leave their simulators to others.
     closed = [("drawn = ", "envs.close()\ndrawn = "), ("inner = ", "seeing.close()\ninner = ")]
     closed.append(("env = TensorEnv", "envs.close()\nenv = TensorEnv"))
-    names = run_page("environments.md", *fewer, *closed)
+    names = run_page("environments.md", *fewer, *closed, *MOVE)
     assert names["info"]["score"] >= 0.0
     assert names["infos"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
@@ -126,18 +132,18 @@ def test_environments():
 
 @pytest.mark.usefixtures("small")
 def test_a_policy_and_the_state_that_it_reaches():
-    """Train on Torus for two episodes; load the policy, and make the final state the target."""
-    words = ["task=Torus", "method=ppo", "method.episodes=2", "method.num_envs=2", "method.hidden=[8]"]
+    """Train on Move for two episodes; load the policy, and make the final state the target."""
+    words = ["task=Move", "method=ppo", "method.episodes=2", "method.num_envs=2", "method.hidden=[8]"]
     words += ["method.steps_per_update=100", "method.minibatches=2", "method.epochs=1"]
     cfg = load_config([*words, *COARSE_32, "progress=false"])
     run_config(cfg)
-    names = run_page("rl.md", ("results/Torus-v1/ppo/seed0-12ab34cd.h5", str(cfg.path)))
+    names = run_page("rl.md", ("results/Torus-v1/ppo/seed0-12ab34cd.h5", str(cfg.path)), ("Torus", "Move"))
     assert names["dones"].all() and names["rewards"].shape == (4,)
     result = read(cfg.path)
     reached = result.iterations["score"].iloc[-1]
     assert [info["score"] for info in names["infos"]] == pytest.approx([reached] * 4, abs=1e-6)
     run_page("own_shapes.md")
-    with contextlib.closing(plab.make("Torus")) as env:
+    with contextlib.closing(plab.make("Move")) as env:
         problem = env.unwrapped.batch.problem
         mass = build_target(problem.scenes[0], {"recipe": "mass", "file": "mass.npy"})
         problem.simulator.set_target(mass[None], target_sdf(mass)[None])
@@ -162,7 +168,7 @@ def test_rendering():
     pytest.importorskip("k3d")
     pytest.importorskip("pyvista")
     (words,) = re.findall(r"\[.task=Torus.*?\]", (DOCS / "rendering.md").read_text(encoding="utf-8"))
-    names = run_page("rendering.md", *((old, '["task=Rope"]') for old in (words, '["task=Pinch"]')))
+    names = run_page("rendering.md", *((old, '["task=Move"]') for old in (words, '["task=Pinch"]')))
     assert names["picture"].shape == (360, 480, 3)
 
 
@@ -184,18 +190,18 @@ def python(folder: Path, *words: str, path: Path = SRC) -> subprocess.CompletedP
 SEARCH = ("--config-dir", str(METHOD / "conf"), "method=random_search", *COARSE, "method.iterations=4")
 
 
-def test_a_method_of_ones_own(tmp_path):
-    done = python(tmp_path, "-m", "plab.run", "-m", *SEARCH, "seed=0,1")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
+def test_a_method_of_ones_own(tmp_path, monkeypatch, capsys, told):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert main(["-m", *SEARCH, "seed=0,1"]) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and out.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
     table = load(tmp_path / "results", keys=["method.family"])
     columns = ["method", "status", "iterations", "method.family"]
     assert table[columns].values.tolist() == [["random_search", "finished", 4, "random_search:FAMILY"]] * 2
     # Whoever reads the results need not have the module.
     assert python(tmp_path, "-m", "plab.results", "check", "results").returncode == 0
-    refused = python(tmp_path, "-m", "plab.run", *SEARCH, "method.spread=0")
-    assert refused.returncode == 2 and refused.stderr.startswith("plab: method.spread")
-    assert refused.stderr.count("\n") == 1
+    assert told([*SEARCH, "method.spread=0"]).startswith("plab: method.spread")
 
 
 def test_an_interrupted_search_goes_on(tmp_path):

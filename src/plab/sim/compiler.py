@@ -82,6 +82,7 @@ else:
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
     from taichi.lang.kernel_impl import Kernel
     from taichi.lang.source_builder import SourceBuilder
+    from taichi.lang.util import to_taichi_type
 
     sys.meta_path.remove(_PatchingFinder)
     _TRACE = "_get_tree_and_ctx"
@@ -102,10 +103,25 @@ def _read_sources_once() -> None:
     _traced.textwrap = SimpleNamespace(fill=functools.cache(fill), dedent=functools.cache(dedent))
 
 
+def _share_traces() -> None:
+    """Trace a kernel once for NumPy and Taichi arrays of the same type: patches
+    ``TaichiCallableTemplateMapper.extract_arg``."""
+    mapper, type_of = _traced.TaichiCallableTemplateMapper, functools.cache(to_taichi_type)
+    extract = mapper.extract_arg
+
+    def extracted(arg: Any, annotation: Any, name: str) -> Any:
+        found = extract(arg, annotation, name)
+        array = isinstance(annotation, ti.types.ndarray) and hasattr(arg, "dtype")
+        return (type_of(found[0]), *found[1:]) if array else found
+
+    mapper.extract_arg = staticmethod(extracted)
+
+
 if not QUADRANTS:
     if not hasattr(_traced._inside_class, "__wrapped__"):
         _skip_source_search(_traced)
     _read_sources_once()
+    _share_traces()
 
 
 # -- compiling ----------------------------------------------------------------------------------------------
