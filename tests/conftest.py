@@ -27,10 +27,10 @@ os.environ["PLAB_TRACEBACK"] = "1"
 OF_ANY_DEVICE = ("tests/test_simulator.py", "tests/test_mixed_materials.py", "tests/verification/")
 """Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
-MOVE = "rl envs wrappers actors planners tutorials cameras datasets demonstrations mpc draws render".split()
+MOVE = """rl envs wrappers actors planners tutorials cameras datasets demonstrations mpc draws population
+bench submissions_played targets render view suite""".split()
 ROPE = "autograd trajectory sweep_simulated".split()
-"""Files whose simulators are of the same kinds, of the tasks Move and Rope, the latter in float64."""
-
+"""Files whose simulators are of the same kinds: most of the task Move, and Rope in float64."""
 FIRST = """manipulators protocol kernel_pairs simulator losses kinematics laws mixed_laws mixed_materials
 free_bodies runtime""".split()
 """Files that start after those: in float64 or with more threads, which invalidates all other simulators."""

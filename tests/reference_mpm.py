@@ -317,6 +317,8 @@ def contact(v: Tensor, u: Tensor, d: Tensor, normal: Tensor, friction: float, al
     touches = d <= 0
     if alpha > 0:
         touches = touches | (s[:, 0] > STRENGTH_THRESHOLD)
+    if not touches.any():
+        return v
     r = v - u
     r_n = (r * normal).sum(dim=-1, keepdim=True)
     t = r - r_n.clamp(max=0.0) * normal
