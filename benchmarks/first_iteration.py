@@ -4,8 +4,6 @@
 Words that are folders are checkouts of plab, timed in turns; all others are overrides.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import subprocess
@@ -15,7 +13,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-ROUNDS = 5
+ROUNDS = 3
 
 COMMANDS = {
     "import plab": ["-c", "import plab"],
@@ -28,8 +26,8 @@ COMMANDS = {
 
 def seconds(checkout: str, words: list[str], cache: str, line: str = "") -> float:
     """Time a command, up to its first line of output that contains ``line`` if given."""
-    folders = {"PLAB_CACHE_DIR": f"{cache}/plab", "PYTHONPATH": f"{Path(checkout).resolve()}/src"}
-    folders |= {"TI_OFFLINE_CACHE_FILE_PATH": f"{cache}/taichi"}
+    folders = {"PLAB_CACHE_DIR": f"{cache}/plab", "TI_OFFLINE_CACHE_FILE_PATH": f"{cache}/taichi"}
+    folders["PYTHONPATH"] = f"{Path(checkout).resolve()}/src"
     begin, end = time.perf_counter(), 0.0
     command = subprocess.Popen(
         [sys.executable, *words], env=os.environ | folders, cwd=cache, stdout=subprocess.PIPE, text=True
@@ -42,9 +40,10 @@ def seconds(checkout: str, words: list[str], cache: str, line: str = "") -> floa
 
 
 def main(words: list[str]) -> None:
+    """Print name of the command, checkout, and minimum and median of the rounds [s]."""
     checkouts = [word for word in words if Path(word).is_dir()] or ["."]
     overrides = [word for word in words if word not in checkouts] or ["task=Move"]
-    run = ["-u", "-m", "plab", "run", *overrides, "method.iterations=2"]
+    run = ["-m", "plab", "run", *overrides, "method.iterations=2"]
     taken: dict[tuple[str, str], list[float]] = defaultdict(list)
     for _ in range(ROUNDS):
         for checkout in checkouts:

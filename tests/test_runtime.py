@@ -58,13 +58,13 @@ def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
     start_runtime("cpu", "float32")
     former = ti.ndarray(ti.f32, 3)
     start_runtime("cpu", "float64")
-    own, freed = ti.ndarray(ti.f64, 3), []
+    own, freed = [ti.ndarray(kind, 3) for kind in (ti.f64, ti.types.vector(2, ti.f64))], []
     runtime = SimpleNamespace(prog=SimpleNamespace(delete_ndarray=freed.append))
     monkeypatch.setattr(compiler._ndarray, "impl", SimpleNamespace(get_runtime=lambda: runtime))
-    kept = own.arr
+    kept = {array.arr for array in own}
     del former, own
     gc.collect()
-    assert freed == [kept]
+    assert len(freed) == 2 and set(freed) == kept
 
 
 @pytest.mark.skipif(QUADRANTS or not os.path.exists("/proc/self/statm"), reason="of Taichi, on Linux")

@@ -77,7 +77,7 @@ else:
     sys.meta_path.insert(0, _PatchingFinder)
     import taichi as ti
     from taichi._snode.fields_builder import FieldsBuilder
-    from taichi.lang import _ndarray, impl
+    from taichi.lang import _ndarray, impl, matrix
     from taichi.lang import kernel_impl as _traced
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
     from taichi.lang.kernel_impl import Kernel
@@ -195,31 +195,35 @@ def clear_kernel_arguments() -> None:
 
 
 def guard_array_release() -> None:
-    """Prevent arrays created before a reinitialisation of Taichi from freeing memory: patches
-    ``ScalarNdarray.__init__`` and ``__del__``.
+    """Free arrays of vectors, too, but none created before a reinitialisation of Taichi: patches ``__init__``
+    and ``__del__`` of ``ScalarNdarray`` and ``VectorNdarray``.
 
-    Otherwise Taichi might free a new array at the same address.
+    Taichi frees arrays of numbers only, and might free a new array at the same address.
     """
-    if QUADRANTS:
-        return
-    kind, current = _ndarray.ScalarNdarray, impl.get_runtime
-    make, free = kind.__init__, kind.__del__
-    if hasattr(free, "__wrapped__"):
+    current = impl.get_runtime
+    if QUADRANTS or hasattr(_ndarray.ScalarNdarray.__del__, "__wrapped__"):
         return
 
-    @functools.wraps(make)
-    def made(self: Any, *args: Any, **words: Any) -> None:
-        self.start = weakref.ref(current())
-        make(self, *args, **words)
+    def patch(kind: Any, free: Callable[[Any], None]) -> None:
+        make = kind.__init__
 
-    @functools.wraps(free)
-    def freed(self: Any) -> None:
-        # The program is missing during interpreter shutdown.
-        runtime = current()
-        if runtime is not None and self.start() is runtime:
-            free(self)
+        @functools.wraps(make)
+        def made(self: Any, *args: Any, **words: Any) -> None:
+            self.start = weakref.ref(current())
+            make(self, *args, **words)
 
-    kind.__init__, kind.__del__ = made, freed
+        @functools.wraps(free)
+        def freed(self: Any) -> None:
+            # The program is missing during interpreter shutdown.
+            runtime = current()
+            if runtime is not None and self.start() is runtime:
+                free(self)
+
+        kind.__init__, kind.__del__ = made, freed
+
+    release = _ndarray.ScalarNdarray.__del__
+    for kind in (_ndarray.ScalarNdarray, matrix.VectorNdarray):
+        patch(kind, release)
 
 
 def place_fields() -> Any:
