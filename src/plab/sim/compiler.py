@@ -2,19 +2,19 @@
 
 Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025) and
 Quadrants 1.3.3; pyproject.toml lists the supported versions. Each function documents its changes and their
-reason. The standard library is not changed. :mod:`plab.sim` imports this module before any kernel is defined,
-as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
+reason. The standard library is changed only while Taichi is imported. :mod:`plab.sim` imports this module
+before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator
-from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
 from textwrap import dedent, fill
@@ -23,45 +23,6 @@ from typing import Any
 
 QUADRANTS = os.environ.get("PLAB_COMPILER") == "quadrants" or find_spec("taichi") is None
 """True if kernels are compiled by Quadrants: Taichi is missing, or PLAB_COMPILER=quadrants."""
-
-
-def _skip_source_search(module: Any) -> None:
-    """Detect methods in Taichi's decorators without searching for sources: patches
-    ``kernel_impl._inside_class``.
-
-    For each function, Taichi calls ``inspect`` for the source of the importing module, which searches all
-    modules every time and takes half of the import of Taichi and a quarter of the simulator's.
-    """
-    tell = module._inside_class
-
-    @functools.wraps(tell)
-    def inside_class(level_of_class_stackframe: int) -> bool:
-        # The frame below the one that Taichi inspects is a class body or not.
-        if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
-            return False
-        return bool(tell(level_of_class_stackframe + 1))
-
-    module._inside_class = inside_class
-
-
-class _PatchingFinder:
-    """Import hook that patches Taichi's decorators before Taichi defines its own functions."""
-
-    @staticmethod
-    def find_spec(name: str, path: Any, target: Any = None) -> Any:
-        """Return the module's spec, with the patch after its execution."""
-        if name != "taichi.lang.kernel_impl":
-            return None
-        spec: Any = PathFinder.find_spec(name, path, target)
-        execute = spec.loader.exec_module
-
-        def execute_patched(module: Any) -> None:
-            execute(module)
-            _skip_source_search(module)
-
-        spec.loader.exec_module = execute_patched
-        return spec
-
 
 if QUADRANTS:
     import quadrants as ti
@@ -73,9 +34,12 @@ if QUADRANTS:
     _TRACE = "get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.mem_fence
 else:
-    # No effect if Taichi is already imported.
-    sys.meta_path.insert(0, _PatchingFinder)
-    import taichi as ti
+    # Taichi's decorators search all modules for the sources of its functions, none of which is a method.
+    _find, inspect.getframeinfo = inspect.getframeinfo, lambda *_: ("", 0, "", [""], 0)  # type: ignore
+    try:
+        import taichi as ti
+    finally:
+        inspect.getframeinfo = _find
     from taichi._snode.fields_builder import FieldsBuilder
     from taichi.lang import _ndarray, impl, matrix
     from taichi.lang import kernel_impl as _traced
@@ -84,7 +48,6 @@ else:
     from taichi.lang.source_builder import SourceBuilder
     from taichi.lang.util import to_taichi_type
 
-    sys.meta_path.remove(_PatchingFinder)
     _TRACE = "_get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.memfence
 
@@ -92,12 +55,24 @@ else:
 # -- definitions of kernels ---------------------------------------------------------------------------------
 
 
-def _read_sources_once() -> None:
-    """Read the source of each function once: patches ``getsourcelines``, ``getsourcefile`` and ``textwrap``
-    of ``kernel_impl``.
+def _skip_source_search() -> None:
+    """Detect methods in Taichi's decorators without searching for sources, and read each source once: patches
+    ``_inside_class``, ``getsourcelines``, ``getsourcefile`` and ``textwrap`` of ``kernel_impl``.
 
-    Taichi reads and tokenises it for every call in a kernel, a quarter of the time with a warm cache.
+    For each function, Taichi calls ``inspect`` for the source of the importing module, which searches all
+    modules every time and takes a quarter of the simulator's import; for each call in a kernel, it tokenises
+    the source again, a quarter of the time to trace the kernel.
     """
+    tell = _traced._inside_class
+
+    @functools.wraps(tell)
+    def inside_class(level_of_class_stackframe: int) -> bool:
+        # The frame below the one that Taichi inspects is a class body or not.
+        if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
+            return False
+        return bool(tell(level_of_class_stackframe + 1))
+
+    _traced._inside_class = inside_class
     for name in ("getsourcelines", "getsourcefile"):
         setattr(_traced, name, functools.lru_cache(maxsize=1000)(getattr(_traced, name)))
     _traced.textwrap = SimpleNamespace(fill=functools.cache(fill), dedent=functools.cache(dedent))
@@ -118,9 +93,7 @@ def _share_traces() -> None:
 
 
 if not QUADRANTS:
-    if not hasattr(_traced._inside_class, "__wrapped__"):
-        _skip_source_search(_traced)
-    _read_sources_once()
+    _skip_source_search()
     _share_traces()
 
 
@@ -200,13 +173,14 @@ def guard_array_release() -> None:
 
     Taichi frees arrays of numbers only, and might free a new array at the same address.
     """
-    current = impl.get_runtime
-    if QUADRANTS or hasattr(_ndarray.ScalarNdarray.__del__, "__wrapped__"):
+    if QUADRANTS:
+        return
+    current, kinds = impl.get_runtime, (_ndarray.ScalarNdarray, matrix.VectorNdarray)
+    free = kinds[0].__del__
+    if hasattr(free, "__wrapped__"):
         return
 
-    def patch(kind: Any, free: Callable[[Any], None]) -> None:
-        make = kind.__init__
-
+    def patch(kind: Any, make: Callable[..., None]) -> None:
         @functools.wraps(make)
         def made(self: Any, *args: Any, **words: Any) -> None:
             self.start = weakref.ref(current())
@@ -221,9 +195,8 @@ def guard_array_release() -> None:
 
         kind.__init__, kind.__del__ = made, freed
 
-    release = _ndarray.ScalarNdarray.__del__
-    for kind in (_ndarray.ScalarNdarray, matrix.VectorNdarray):
-        patch(kind, release)
+    for kind in kinds:
+        patch(kind, kind.__init__)
 
 
 def place_fields() -> Any:
