@@ -5,18 +5,17 @@ Words that are folders are checkouts of plab, timed in turns; all others are ove
 """
 
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
 from pathlib import Path
+from statistics import median
 
 ROUNDS = 3
 
 COMMANDS = {
-    "import plab": ["-c", "import plab"],
     "import plab.sim": ["-c", "import plab.sim"],
     "plab run --help": ["-m", "plab", "run", "--help"],
     "plab run --cfg job": ["-m", "plab", "run", "--cfg", "job"],
@@ -24,27 +23,27 @@ COMMANDS = {
 }
 
 
-def seconds(checkout: str, words: list[str], cache: str, line: str = "") -> float:
-    """Time a command, up to its first line of output that contains ``line`` if given."""
-    folders = {"PLAB_CACHE_DIR": f"{cache}/plab", "TI_OFFLINE_CACHE_FILE_PATH": f"{cache}/taichi"}
-    folders["PYTHONPATH"] = f"{Path(checkout).resolve()}/src"
-    begin, end = time.perf_counter(), 0.0
-    command = subprocess.Popen(
-        [sys.executable, *words], env=os.environ | folders, cwd=cache, stdout=subprocess.PIPE, text=True
-    )
-    for printed in command.stdout or ():
-        end = end or (time.perf_counter() - begin if line and line in printed else 0.0)
-    if command.wait():
+def seconds(checkout: str, words: list[str], cache: str, line: str = "") -> tuple[float, float]:
+    """Time a command, up to its first line of output that contains ``line`` if given: wall and CPU time."""
+    caches = {"PLAB_CACHE_DIR": f"{cache}/plab", "TI_OFFLINE_CACHE_FILE_PATH": f"{cache}/taichi"}
+    env = os.environ | caches | {"PYTHONPATH": f"{Path(checkout).resolve()}/src"}
+    begin = time.perf_counter()
+    child = subprocess.Popen([sys.executable, *words], env=env, cwd=cache, stdout=subprocess.PIPE, text=True)
+    next((printed for printed in child.stdout or () if line and line in printed), None)
+    ticks = Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    taken = time.perf_counter() - begin, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+    child.communicate()
+    if child.returncode:
         sys.exit(f"{checkout}: {' '.join(words)} failed")
-    return end or time.perf_counter() - begin
+    return taken
 
 
 def main(words: list[str]) -> None:
-    """Print name of the command, checkout, and minimum and median of the rounds [s]."""
+    """Print command, checkout, and minimum and median of the wall and the CPU time [s]."""
     checkouts = [word for word in words if Path(word).is_dir()] or ["."]
     overrides = [word for word in words if word not in checkouts] or ["task=Move"]
     run = ["-m", "plab", "run", *overrides, "method.iterations=2"]
-    taken: dict[tuple[str, str], list[float]] = defaultdict(list)
+    taken = defaultdict(list)
     for _ in range(ROUNDS):
         for checkout in checkouts:
             with tempfile.TemporaryDirectory() as cache:
@@ -53,7 +52,8 @@ def main(words: list[str]) -> None:
                 for name, command in COMMANDS.items():
                     taken[name, checkout].append(seconds(checkout, command, cache))
     for (name, checkout), times in sorted(taken.items()):
-        print(f"{name:20} {checkout:12} {min(times):6.2f} {statistics.median(times):6.2f}")
+        shown = [f"{of(column):6.2f}" for column in zip(*times, strict=True) for of in (min, median)]
+        print(f"{name:20} {checkout:12}", *shown)
 
 
 if __name__ == "__main__":
