@@ -99,29 +99,16 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
 def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     """Return the distance of every grid node to the nearest node of the target [domain units], shape [n, n,
     n]. Nodes with a mass above ``threshold`` belong to the target; raise ValueError if there are none."""
+    # Imported here, because SciPy would slow down every `--help`.
+    from scipy.ndimage import distance_transform_edt
+
     mass = np.asarray(mass, dtype=np.float64)
     outside = ~(mass > threshold)
     if outside.all():
         raise ArgumentError(
             f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}"
         )
-    nodes = mass.shape[0]
-    if nodes > 64:
-        # Faster than the loops below from here on, but its import takes ten times as long as those.
-        from scipy.ndimage import distance_transform_edt
-
-        return distance_transform_edt(outside) / nodes
-    # Squares of the distances along the first axis, the first two, and all axes.
-    squared = np.where(outside, np.int32(3 * nodes**2), np.int32(0))
-    for _axis in range(3):
-        along = np.ascontiguousarray(np.moveaxis(squared, 0, 2))
-        squared = along.copy()
-        for step in range(1, nodes):
-            if step**2 >= squared.max():
-                break
-            np.minimum(squared[step:], along[:-step] + step**2, out=squared[step:])
-            np.minimum(squared[:-step], along[step:] + step**2, out=squared[:-step])
-    return np.sqrt(squared) / nodes
+    return distance_transform_edt(outside) / mass.shape[0]
 
 
 def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
