@@ -279,7 +279,7 @@ class Runner:
         self._phase, self._since, self._timed, self._shown = "", 0.0, self.tracks, ""
 
     # ------------------------------------------------------------------------------------------------ hooks
-    # Not abstract methods: a runner overrides either step or iterate, which the class cannot express.
+    # None is abstract: a runner needs build, and step or iterate, but none of them if it overrides run.
 
     def build(self) -> None:
         """Check that the runs can be executed, and create their shared objects, at least :attr:`problem`."""

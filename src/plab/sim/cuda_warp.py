@@ -26,6 +26,9 @@ WARP = 32
 WARP_BLOCK = 128
 """Threads per block in loops with shared memory."""
 
+LARGEST_CELL = 4096
+"""Largest number of particles of a cell that are sorted by number."""
+
 RUN_BITS = 5
 """Runs of particles in one cell have at most the length of a warp, 2^5."""
 
@@ -414,23 +417,24 @@ class OrderPhases(WarpPhases):
     @ti.func
     def place_in_cell(self, first, place):
         """Return the place by number among the particles of a cell, which are stored in any order, given the
-        place of one; ``first`` is the environment's first."""
+        place of one; ``first`` is the environment's first. Larger cells, of diverged states, stay in any
+        order: the time increases with the square of their particles."""
         own = self.cell_key[first + place]
         below, begin = 0, place
-        while begin > 0:
+        while begin > ti.max(0, place - LARGEST_CELL):
             key = self.cell_key[first + begin - 1]
             if key >> 32 != own >> 32:
                 break
             below += ti.cast(key < own, ti.i32)
             begin -= 1
         after = place + 1
-        while after < self.particles:
+        while after < ti.min(self.particles, place + LARGEST_CELL + 1):
             key = self.cell_key[first + after]
             if key >> 32 != own >> 32:
                 break
             below += ti.cast(key < own, ti.i32)
             after += 1
-        return begin + below
+        return ti.select(after - begin > LARGEST_CELL, place, begin + below)
 
     @ti.kernel
     def sort(
