@@ -27,7 +27,7 @@ from toy_runner import COARSE
 
 WEIGHTS = (10.0, 10.0, 1.0)
 TERMS = dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True))
-KINDS = ("Sphere", "RollingPin")
+KINDS = ("Sphere", "RollingPin", "Box")
 FIELDS = {"start": "sampling_convention", "numbers": "digits_convention", "floor": "floor_stencil"}
 
 
@@ -48,8 +48,8 @@ def released(near: tuple[str, ...], **changes: float) -> Scene:
 
 SCENES = [
     released(("Sphere",), floor_friction=0.4),
-    released(("RollingPin", "Sphere"), floor_friction=100.0),
-    released(("RollingPin",), floor_friction=0.0, yield_stress=5.0),
+    released(("RollingPin", "Box"), floor_friction=100.0),
+    released(("Box",), floor_friction=0.0, yield_stress=5.0),
 ]
 
 

@@ -13,7 +13,7 @@ from plab.config import ConfigError, TaskConfig, choices, load_config
 from plab.config.compose import compose
 from plab.config.randomization import FIRST_TARGET_SEED, draw_variant
 
-SCENES = 8
+SCENES = 12
 """Number of samples per task; their extremes are more than half of a range apart."""
 
 
