@@ -27,10 +27,10 @@ BODIES = [
     *(Body("box", (0.5, 0.3, 0.5), (0.2, 0.2, 0.2), 10, law=law) for law in LAWS if law != "von_mises"),
 ]
 # Most particles of the second environment leave the range of the series.
-WHOLE = [suite.scene(suite.KINDS, grid_size=16, yield_stress=stress) for stress in (60.0, 400.0)]
-# One shape of each motion.
-TOOLS = [suite.tools(one, ("Sphere", "RollingPin", "Chopsticks", "Cylinder", "Box")) for one in WHOLE]
-SCENES = [replace(one, bodies=tuple(BODIES), manipulators=TOOLS[0]) for one in WHOLE]
+SCENES = [
+    replace(suite.scene(suite.KINDS, grid_size=16, yield_stress=stress), bodies=tuple(BODIES))
+    for stress in (60.0, 400.0)
+]
 STRAINS = (0.02, 0.6)
 
 PARTS = 4  # CUDA's warps for 32 particles
