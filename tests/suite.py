@@ -6,12 +6,14 @@ All environments of a batch share one compiled simulator, so that one compilatio
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 
 from plab.losses.term import ParticleTerm
 from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene
@@ -106,6 +108,22 @@ def batch() -> list[Scene]:
     scenes.append(scene(("Sphere", "Box"), yield_stress=5.0, poisson_ratio=0.05))
     scenes.append(scene(("Torus", "Chopsticks"), yield_stress=math.inf, poisson_ratio=0.4))
     return scenes
+
+
+@contextlib.contextmanager
+def instructions_of_the_host() -> Iterator[None]:
+    """Generate CUDA's bitcode with instructions of the host, in a folder of its own."""
+    from plab.sim.codegen import bitcode
+    from plab.sim.codegen.llvm import Code, Scalars
+
+    own = bitcode._cache() / "host"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Scalars, "product", Code.mul)
+        patch.setattr(Scalars, "div", Code.div)
+        patch.setattr(bitcode, "_cache", lambda: own)
+        bitcode.bitcode_file.cache_clear()
+        yield
+    bitcode.bitcode_file.cache_clear()
 
 
 class Kinetic(ParticleTerm):

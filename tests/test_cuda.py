@@ -1,4 +1,4 @@
-"""CUDA against the CPU, which tests/test_simulator.py compares with the reference; single-launch steps.
+"""CUDA against the CPU, which tests/test_simulator.py compares with the reference.
 
 In float64 the kernels of both devices differ only in the order of sums, so the remaining errors are rounding.
 """
@@ -10,10 +10,16 @@ import pytest
 import plab.sim.cuda_engine as cuda_engine
 from cuda_scenes import assert_cuda_agrees_with_the_cpu
 
+pytestmark = [pytest.mark.gpu]
 
-@pytest.mark.gpu
+
 def test_steps_of_one_launch_agree_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 1000)
-    # Warps share tiles by 11, 11 and 10 particles.
-    monkeypatch.setattr(cuda_engine, "MAX_TILE_WARPS", 3)
+    # Two warps share a tile.
+    monkeypatch.setattr(cuda_engine, "MAX_TILE_WARPS", 2)
+    assert_cuda_agrees_with_the_cpu("nearest")
+
+
+def test_steps_of_many_launches_agree_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 0)
     assert_cuda_agrees_with_the_cpu("nearest")

@@ -20,8 +20,8 @@ COARSE = [*COARSE_32, "sim.horizon=4"]
 pytestmark = [pytest.mark.gpu]
 
 
-def config(device: str = "cuda") -> Config:
-    return load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}"])
+def config(device: str = "cuda", *words: str) -> Config:
+    return load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}", *words])
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +85,11 @@ def test_gradients_of_tensors_stay_on_the_device() -> None:
 
 @pytest.mark.parametrize("envs", [2, 512])
 def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
-    """Include scenes with so many particles that they are sorted by cell."""
+    """Include scenes with so many particles that they are sorted by cell if not deterministic."""
     gradients = []
     for device, size in (("cpu", 2), ("cuda", envs)):
-        episodes = EpisodeBatch([config(device)] * size, contact="soft")
+        fast = f"sim.deterministic={str(size < 512).lower()}"
+        episodes = EpisodeBatch([config(device, fast)] * size, contact="soft")
         if size == 512:
             assert episodes.problem.simulator._engine.sorts
         torch.manual_seed(0)

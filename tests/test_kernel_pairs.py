@@ -4,6 +4,7 @@ CUDA functions without warp operations are compiled for the CPU here, with the C
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -153,9 +154,9 @@ class Threads(CudaPhases):
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[Tiles, Threads]:
+def pair() -> Iterator[tuple[Tiles, Threads]]:
     runtime = start_runtime("cpu", "float64")
-    both = Tiles(SCENES, runtime, True), Threads(SCENES, runtime, True)
+    both = Tiles(SCENES, runtime, True), Threads(SCENES, runtime, True, False)
     assert both[1].batch * both[1].tiles * both[1].lanes % 32 == 0, "threads would read beyond the particles"
     order = np.stack([np.random.default_rng(9).permutation(s.particle_count) for s in SCENES])
     for phases in both:
@@ -163,7 +164,8 @@ def pair() -> tuple[Tiles, Threads]:
         phases.fill_bodies(SCENES, order)
         phases.allocate_adjoint()
         phases.clear_adjoint(ti.ndarray(phases.lane_type, shape=1))
-    return both
+    with suite.instructions_of_the_host():
+        yield both
 
 
 def launch(phases: Tiles | Threads, name: str, *arrays: ti.Ndarray) -> None:

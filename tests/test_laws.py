@@ -14,12 +14,14 @@ import pytest
 import laws
 from plab.config import ConfigError, build_scene, load_config
 from plab.laws import Law
+from plab.laws.algebra import Series
 from plab.scenes import LAWS, Body, Material, Scene, find_law
 from plab.sim import DeviceError, Simulator
 from plab.sim.codegen import bitcode
 from plab.sim.compiler import ti
 from plab.sim.cuda_sums import add
 from plab.sim.runtime import start_runtime
+from suite import instructions_of_the_host
 
 sys.path.append(str(Path(__file__).parents[1] / "examples" / "own_law"))
 SNOW = find_law("snow:SNOW")
@@ -244,7 +246,8 @@ def compiled(device: str, precision: str, law: Law, mixed: bool = False):
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     host = llvm.Target.from_default_triple().create_target_machine(opt=0)
-    module = llvm.parse_bitcode(bitcode._code(device, precision, law, mixed))
+    with instructions_of_the_host():
+        module = llvm.parse_bitcode(bitcode._code(device, precision, law, mixed))
     module.triple, module.data_layout = llvm.get_default_triple(), str(host.target_data)
     engine = llvm.create_mcjit_compiler(module, host)
     engine.finalize_object()
@@ -258,20 +261,23 @@ def compiled(device: str, precision: str, law: Law, mixed: bool = False):
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("name", [name for name in ALL if name != "von_mises"])
-def test_compiled_laws_compute_their_formulas(name: str, precision: str) -> None:
-    """Check a tile on the CPU, a tile with two laws, and a particle on CUDA, forward and adjoint."""
+@pytest.mark.parametrize(("name", "strain"), [*((name, 0.01) for name in ALL), ("von_mises", 0.3)])
+def test_compiled_laws_compute_their_formulas(name: str, strain: float, precision: str) -> None:
+    """Check a tile on the CPU, a tile with two laws, and a particle on CUDA, forward and adjoint; von Mises
+    plasticity on CUDA by series and by singular values."""
+    from plab.sim import storage
     from plab.sim.codegen.materials import law_adjoint
-    from plab.sim.storage import AT_C, AT_F, LAW_PARAMETER_BARS, STATE, STRAIN_LAW, STRAINS
+    from plab.sim.storage import AT_C, AT_F, STATE, STRAIN_LAW, STRAINS
 
-    law, lanes = ALL[name], 8
+    law, lanes, kept = ALL[name], 8, "STRAIN" if name == "von_mises" else "LAW"
+    first, first_bar = getattr(storage, f"{kept}_PARAMETERS"), getattr(storage, f"{kept}_PARAMETER_BARS")
     kind, tolerance = (np.float32, 1e-4) if precision == "f32" else (np.float64, 1e-13)
     rng = np.random.default_rng(3)
     state, bar = rng.normal(size=(2, STATE, lanes)).astype(kind)
-    state[AT_C:AT_F], state[AT_F:] = (x[:, :lanes] for x in deformed(0.01))
+    state[AT_C:AT_F], state[AT_F:] = (x[:, :lanes] for x in deformed(strain))
     affine, own = rng.normal(size=(9, lanes)).astype(kind), coefficients(law)
     c, f = (x.astype(float) for x in (state[AT_C:AT_F], state[AT_F:]))
-    a, f_new = (x[:, :lanes] for x in updated(law, *deformed(0.01), *own))
+    a, f_new = (x[:, :lanes] for x in updated(law, *deformed(strain), *own))
     spread = [np.full(lanes, value) for value in own]
     c_bar, f_bar, own_bar = (
         np.array(np.broadcast_arrays(*x, c[0])[: len(x)])
@@ -284,7 +290,7 @@ def test_compiled_laws_compute_their_formulas(name: str, precision: str) -> None
     numbers = [np.array([value], kind) for value in (1.0, *CONSTANTS)]
     for mixed in (False, True):
         strains, out, new = np.zeros((STRAINS, lanes), kind), np.zeros((9, lanes), kind), state.copy()
-        strains[: law.size] = np.array(own)[:, None]
+        strains[first : first + law.size] = np.array(own)[:, None]
         mine = np.arange(lanes) % 3 > 0 if mixed else np.full(lanes, True)
         strains[STRAIN_LAW] = mine
         call = compiled("cpu", precision, law, mixed)
@@ -299,9 +305,11 @@ def test_compiled_laws_compute_their_formulas(name: str, precision: str) -> None
         close(given[AT_C:AT_F, mine], c_bar[:, mine])
         close(given[AT_F:, mine], f_bar[:, mine])
         assert (given[:, ~mine] == bar[:, ~mine]).all()
-        bars = strains[LAW_PARAMETER_BARS : LAW_PARAMETER_BARS + law.size]
+        bars = strains[first_bar : first_bar + law.size]
         close(bars[:, mine] * np.array(own)[:, None], own_bar[:, mine] * np.array(own)[:, None])
-    call = compiled("cuda", precision, law)
+    call, series = compiled("cuda", precision, law), Series.for_precision(f"float{precision[1:]}")
+    if name == "von_mises":
+        numbers += [np.array([x], kind) for x in (series.z_squared_max, series.j_min, series.j_max)]
     held = [np.array([x], kind) for x in (*state[AT_C:, 0], *own)]
     call("particle", *held, *numbers[1:])
     close(np.ravel(held[:9]), a[:, 0])

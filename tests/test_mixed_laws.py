@@ -90,7 +90,7 @@ def test_each_parameter_has_the_gradient_of_central_differences(simulator: Simul
     actions = np.random.default_rng(7).uniform(-0.9, 0.9, (1, 2, scene.action_dim))
     simulator.rollout(actions)
     gradient = simulator.material_gradient().reshape(len(scene.bodies), -1)
-    noise = 1e-13 if suite.DEVICE == "cpu" else 1e-11
+    noise = 1e-13
 
     def loss(key: str, values: np.ndarray) -> float:
         simulator.set_material(**{key: values if len(scene.bodies) > 1 else values[:, 0]})

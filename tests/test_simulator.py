@@ -55,14 +55,6 @@ def built(scenes: tuple[Scene, ...], device: str, **settings: float) -> Simulato
     return simulator
 
 
-def assert_same(got: np.ndarray, want: np.ndarray) -> None:
-    """Compare bitwise on the CPU, and with a tolerance on CUDA, where the order of sums varies."""
-    if DEVICE == "cpu":
-        np.testing.assert_array_equal(got, want)
-    else:
-        np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
-
-
 @pytest.fixture(scope="module")
 def sim(device: str) -> Simulator:
     return built(SCENES, device)
@@ -128,7 +120,7 @@ def test_other_scenes_in_the_same_simulator_are_as_if_built_anew(sim: Simulator)
     # An environment whose manipulators touch nothing does not cut off the others' gradients.
     far = tuple(replace(m, position=(0.2, 0.8, 0.2)) for m in SCENES[1].manipulators)
     sim.set_scenes([SCENES[0], replace(SCENES[1], manipulators=far), SCENES[2]])
-    assert_same(sim.rollout(ACTIONS).gradient[::2], want.gradient[::2])
+    np.testing.assert_array_equal(sim.rollout(ACTIONS).gradient[::2], want.gradient[::2])
     with pytest.raises(SceneError, match="2 scenes"):
         sim.set_scenes(SCENES[:2])
     with pytest.raises(SceneError, match="substeps"):
@@ -146,9 +138,9 @@ def test_states_in_several_arrays_give_the_same_gradient(
     for length in (STEPS, STEPS // 2):
         got = sim.rollout(ACTIONS)
         assert (len(tape._history), tape._length) == (STEPS, length)
-        assert_same(got.step_terms, want.step_terms)
-        assert_same(got.gradient, want.gradient)
-        assert_same(sim.state().x, final.x)
+        np.testing.assert_array_equal(got.step_terms, want.step_terms)
+        np.testing.assert_array_equal(got.gradient, want.gradient)
+        np.testing.assert_array_equal(sim.state().x, final.x)
         monkeypatch.setattr(sim, "memory_mb", (sim.memory_bytes() - 2 * slot_bytes) / 1e6)
 
 
@@ -184,11 +176,11 @@ def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> Non
     assert got.failures == caught.value.failures
     assert got.failures[1].startswith("environment step 1, substep 1")
     for name in ("step_terms", "step_iou", "gradient"):
-        assert_same(getattr(got, name)[[0, 2]], getattr(want, name)[[0, 2]])
+        np.testing.assert_array_equal(getattr(got, name)[[0, 2]], getattr(want, name)[[0, 2]])
     sim.set_initial_state(start)
     again = sim.rollout(ACTIONS)
     assert not again.failures
-    assert_same(again.gradient, want.gradient)
+    np.testing.assert_array_equal(again.gradient, want.gradient)
 
 
 def test_arguments_are_checked(sim: Simulator) -> None:

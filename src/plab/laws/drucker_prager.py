@@ -40,8 +40,9 @@ def update(c, f, dt, mu, lam, alpha):
     pressed = np.minimum(trace, 0.0)
     k = np.minimum(-(1.5 * lam / mu + 1.0) * alpha * pressed / norm, 1.0)
     pressure = (lam + (2.0 / 3.0) * mu) * pressed
-    tau = frame.tensor([2.0 * mu * (k * e) + pressure for e in deviator])
-    return tau, mul_sym_mat(frame.tensor([np.exp((k - 1.0) * e) for e in deviator]), g)
+    tau = frame.tensor([2.0 * mu * (k * e) + pressure for e in deviator], (trace, k))
+    flow = frame.tensor([np.exp((k - 1.0) * e) for e in deviator], (trace, k))
+    return tau, mul_sym_mat(flow, g)
 
 
 def coefficients(youngs_modulus, poisson_ratio, friction_angle):

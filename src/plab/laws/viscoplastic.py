@@ -32,8 +32,9 @@ def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
     over = np.maximum(2.0 * mu * norm - yield_stress, 0.0)
     k = 1.0 - (over - overstress(over, dt, mu, consistency, 1.0 / exponent)) / (2.0 * mu * norm)
     pressure = (lam + (2.0 / 3.0) * mu) * trace
-    tau = frame.tensor([2.0 * mu * (k * e) + pressure for e in deviator])
-    return tau, mul_sym_mat(frame.tensor([np.exp((k - 1.0) * e) for e in deviator]), g)
+    tau = frame.tensor([2.0 * mu * (k * e) + pressure for e in deviator], (trace, k))
+    flow = frame.tensor([np.exp((k - 1.0) * e) for e in deviator], (trace, k))
+    return tau, mul_sym_mat(flow, g)
 
 
 def overstress(trial, dt, mu, consistency, power):

@@ -8,14 +8,15 @@ The result equals that of an SVD of G.
 
 Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
 rounding: :mod:`plab.laws.algebra` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
-``d = atanh(Z)``, and in d. If ``|Z|`` or J are outside the range in which the series are exact to rounding,
-:mod:`plab.sim.spectral` uses an SVD.
+``d = atanh(Z)``, and in d. If ``|Z|`` or J are outside the range in which the series are exact to rounding
+(strong compression, inverted or nearly singular F, stiff materials that do not yield), :func:`update` uses
+singular values.
 
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
 parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.laws.algebra.Series`.
 
-The update is divided into parts, so that unnecessary parts can be skipped; :mod:`plab.sim.codegen.materials`
-has their schedule, and :mod:`plab.sim.spectral` the update for strains outside the range of the series.
+The update by series is divided into parts, so that unnecessary parts can be skipped;
+:mod:`plab.sim.codegen.materials` has their schedule.
 """
 
 from dataclasses import replace
@@ -23,8 +24,6 @@ from dataclasses import replace
 import numpy as np
 
 from plab.laws.algebra import (
-    Series,
-    det,
     det_sym,
     exp_coefficients,
     inverse_sym,
@@ -32,13 +31,18 @@ from plab.laws.algebra import (
     mul_sym_mat,
     outer_sym,
     square_sym,
+    total,
     trial_gradient,
 )
 from plab.laws.elastic import ELASTIC, lame
 from plab.laws.law import Parameter
+from plab.laws.principal import SingularFrame
 
 NORM_SHIFT = 1e-8
 """Added to |d|^2 under the square root, as in the PlasticineLab release."""
+
+SINGULAR_VALUE_MIN = 0.05
+"""Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
 
 
 def hencky_strain(g, j, series):
@@ -95,12 +99,20 @@ def yield_factor(d, yield_strain):
 
 
 def update(c, f, dt, mu, lam, yield_strain):
-    """Kirchhoff stress and new F within the range of the series."""
-    series = Series.for_precision("float64")
-    g = trial_gradient(c, f, dt)
-    j = det(g)
-    c2, *_rest, d = hencky_strain(g, j, series)
-    return stress(d, j, c2, mu, lam, yield_strain, series), flow(d, g, yield_strain, series)
+    """Kirchhoff stress and new F for any strain, by singular values."""
+    trial = trial_gradient(c, f, dt)
+    frame = SingularFrame(trial)
+    strain = [np.log(np.maximum(value, SINGULAR_VALUE_MIN)) for value in frame.values]
+    mean = total(strain) * (1.0 / 3.0)
+    deviator = [e - mean for e in strain]
+    k = np.minimum(yield_strain / np.sqrt(total(e * e for e in deviator) + NORM_SHIFT), 1.0)
+    yields = k < 1.0
+    pairs = zip(frame.values, deviator, strict=True)
+    new = [np.where(yields, np.exp(mean + k * e), value) for value, e in pairs]
+    j = new[0] * new[1] * new[2]
+    tau = frame.left([2.0 * mu * (v * v - v) + lam * j * (j - 1.0) for v in new], (mean, k, j))
+    flowed = frame.between(new, (mean, k))
+    return tau, [np.where(yields, x, y) for x, y in zip(flowed, trial, strict=True)]
 
 
 YIELD_STRAIN_MAX = 1e30

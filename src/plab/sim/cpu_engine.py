@@ -117,7 +117,7 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
             entry = self.tile_entry(0, e, tile)
             entry9 = self.masked_index((e * self.tiles + tile) * 9)
             at_strains = self.masked_index(grid_index * STRAINS)
-            self.material_tile(state, state_at, source, target, entry9, e, at_strains, not adjoint)
+            self.material_tile(state_at, source, target, entry9, e, at_strains, not adjoint)
             self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
             if ti.static(adjoint):
@@ -207,17 +207,8 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
             for lane in range(self.lanes_of(tile)):
                 node = self.masked_index(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle_adjoint(state_at, source, target, bar_at, entry, entry9, lane, node, at)
-            self.material_tile_adjoint(
-                state,
-                state_at,
-                source,
-                bar,
-                bar_at,
-                entry,
-                entry9,
-                e,
-                self.masked_index(grid_index * STRAINS),
-            )
+            at_strains = self.masked_index(grid_index * STRAINS)
+            self.material_tile_adjoint(state_at, source, bar_at, entry, entry9, e, at_strains)
 
     # -- poses --------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from plab.scenes import Scene
 from plab.sim.compiler import local_variable, ti
-from plab.sim.particle_phases import ParticlePhases, at_base, spline, spline_slope
+from plab.sim.particle_phases import ParticlePhases, spline, spline_slope
 from plab.sim.storage import (
     ADJOINT_FIELD,
     AT_C,
@@ -47,6 +47,13 @@ REACHING = tuple(
     sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8)
 )
 """Bit mask of the kinds of crossing that reach each of the 8 blocks around the base node's block."""
+
+
+@ti.func
+def at_base(value, row: ti.template(), f: ti.template(), scale):
+    """One component of an affine field at the base node, given its value at the particle and its row of the
+    matrix A; ``scale`` is the factor of A times the grid spacing."""
+    return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
 
 
 class TilePhases(ParticlePhases):
@@ -276,22 +283,19 @@ class TilePhases(ParticlePhases):
         return [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(last_at, last, 0)]
 
     @ti.func
-    def material_tile(
-        self, state: ti.template(), state_at, source, target, entry9, e, at, update: ti.template()
-    ):
+    def material_tile(self, state_at, source, target, entry9, e, at, update: ti.template()):
         """Compute A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry
         ``at``; store the new F if ``update``."""
         first, x, affine, new = self.law_places(state_at, source, state_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(not self.scheduled(number)):
-                    self.put_parameters(e, entry9, at, LAW_PARAMETERS, self.laws[number].size)
-                    numbers = [number, self.dt, self.stress_scale, self.mass]
+                whole = [number, self.dt, self.stress_scale, self.mass]
+                if not self.in_series(first, x, e, entry9, at, number, "strain"):
                     if ti.static(update):
-                        self.call(number, "update", [first, x, affine, new], numbers)
+                        self.call(number, "update", [first, x, affine, new], whole)
                     else:
-                        self.call(number, "stress_only", [first, x, affine], numbers)
-                elif self.strain_tile(first, x, e, entry9, at, number, "strain"):
+                        self.call(number, "stress_only", [first, x, affine], whole)
+                elif ti.static(self.scheduled(number)):
                     # In parts; the new F is computed last.
                     numbers = [number, self.stress_scale, self.mass]
                     rigid = self.call_returning(number, "stress", [first, x, affine], numbers)
@@ -300,20 +304,25 @@ class TilePhases(ParticlePhases):
                             self.call(number, "flow", [first, new], [number])
                         else:
                             self.call(number, "rest", [first, new], [number])
-                else:
-                    for lane in range(self.lanes):
-                        if self.is_own(entry9, lane, number):
-                            a = self.spectral_material(state, source, target, lane, e, update)
-                            for i in ti.static(range(9)):
-                                self.affine[entry9 + i][lane] = a[i]
 
     @ti.func
-    def strain_tile(self, first, x, e, entry9, at, number: ti.template(), kind: ti.template()):
-        """Write strain and parameters of a tile to ``strains``, with ``whole_strain`` also the intermediate
-        results for the adjoint; return whether all lanes are in the range of the series."""
-        self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
-        limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return self.call_returning(number, kind, [first, x], limits) > 0.0
+    def in_series(self, first, x, e, entry9, at, number: ti.template(), kind: ti.template()):
+        """Write a tile's parameters to ``strains``; return whether the law has a series and all lanes are in
+        its range. Then also write the strain, with ``whole_strain`` the intermediate results for the
+        adjoint."""
+        place = ti.static(self.first_parameter(number, False))
+        self.put_parameters(e, entry9, at, place, self.laws[number].size)
+        if ti.static(self.scheduled(number)):
+            limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
+            return self.call_returning(number, kind, [first, x], limits) > 0.0
+        else:
+            return False
+
+    def first_parameter(self, number: int, adjoint: bool) -> int:
+        """Return the first entry of a law's coefficients or their adjoints in ``strains``."""
+        if self.scheduled(number):
+            return STRAIN_PARAMETER_BARS if adjoint else STRAIN_PARAMETERS
+        return LAW_PARAMETER_BARS if adjoint else LAW_PARAMETERS
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
@@ -324,21 +333,15 @@ class TilePhases(ParticlePhases):
             return True
 
     @ti.func
-    def material_tile_adjoint(
-        self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
-    ):
+    def material_tile_adjoint(self, state_at, source, bar_at, target, entry9, e, at):
         """Adjoints of a tile's C and F, given those of A (in ``affine``) and the new F (in ``bar``)."""
         first, x, affine, bars = self.law_places(state_at, source, bar_at, target, entry9, at)
         for number in ti.static(range(len(self.laws))):
             if self.has_law(entry9, number):
-                if ti.static(not self.scheduled(number)):
-                    size = ti.static(self.laws[number].size)
-                    self.put_parameters(e, entry9, at, LAW_PARAMETERS, size)
+                if not self.in_series(first, x, e, entry9, at, number, "whole_strain"):
                     numbers = [number, self.dt, self.stress_scale, self.mass]
                     self.call(number, "adjoint", [first, x, affine, bars], numbers)
-                    if ti.static(self.full_gradient):
-                        self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, size, number)
-                elif self.strain_tile(first, x, e, entry9, at, number, "whole_strain"):
+                elif ti.static(self.scheduled(number)):
                     rigid = self.call_returning(
                         number, "stress_adjoint", [first, affine], [number, self.stress_scale]
                     )
@@ -346,24 +349,16 @@ class TilePhases(ParticlePhases):
                         self.call(number, "flow_adjoint", [first, bars], [number])
                     else:
                         self.call(number, "rest_adjoint", [first, bars], [number])
-                    if ti.static(self.full_gradient):
-                        self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
                     ends = [number, self.dt, self.mass]
                     self.call(number, "strain_adjoint", [first, x, affine, bars], ends)
-                else:
-                    for lane in range(self.lanes):
-                        if self.is_own(entry9, lane, number):
-                            a_bar = self.load(self.affine, entry9, lane, 9)
-                            self.spectral_material_adjoint(
-                                state, source, bar, target, a_bar, lane, e, at // STRAINS
-                            )
+                if ti.static(self.full_gradient):
+                    self.parameter_tile_adjoint(entry9, at, number)
 
     @ti.func
-    def parameter_tile_adjoint(
-        self, entry9, at, first: ti.template(), count: ti.template(), number: ti.template()
-    ):
+    def parameter_tile_adjoint(self, entry9, at, number: ti.template()):
         """Add a tile's adjoints of the material's coefficients, from ``strains``."""
-        bars = [self.strains[at + first + i] for i in range(count)]
+        first = ti.static(self.first_parameter(number, True))
+        bars = [self.strains[at + first + i] for i in range(self.laws[number].size)]
         if ti.static(self.mixed):
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):

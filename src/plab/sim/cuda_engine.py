@@ -75,6 +75,8 @@ class CudaEngine(CudaPhases):
         self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
         self.mass_blocks = ti.field(ti.i32, shape=1)
+        # In place of an order.
+        self.no_order = ti.ndarray(ti.i32, shape=1)
 
     @property
     def reduction_threads(self) -> int:
@@ -96,12 +98,19 @@ class CudaEngine(CudaPhases):
 
     # -- public methods -----------------------------------------------------------------------------
 
-    def step(self, state, poses, actions, slot, stride, t, pose_before, pose_after, stamp) -> None:
+    def step(
+        self, state, poses, actions, slot, stride, t, pose_before, pose_after, stamp, order=None
+    ) -> None:
         """Run one environment step from time slot ``slot``; each substep advances by ``stride`` slots (0: in
-        place)."""
+        place). With ``order``, the first six arguments of :meth:`sort`, particles are sorted into this slot
+        first, with the stamp before."""
         if self.resident:
-            self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
+            unsorted = (state, slot, self.no_order, self.no_order, self.no_order, -1)
+            motion = (state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
+            self.resident_step_kernel(*motion, *(order or unsorted))
             return
+        if order:
+            self.sort(*order, state, slot, stamp - 1)
         self.advance_kernel(poses, actions, t, pose_before, pose_after)
         for s in range(self.substeps):
             before = slot + s * stride
@@ -164,11 +173,45 @@ class CudaEngine(CudaPhases):
         pose_before: ti.i32,
         pose_after: ti.i32,
         stamp: ti.i32,
+        source: Array,
+        source_slot: ti.i32,
+        numbers: Array,
+        after: Array,
+        moves: Array,
+        order_step: ti.i32,
     ):
-        """Run one environment step in a single launch, for few particles. Resident threads synchronise at
-        barriers between the phases, because launches would take longer than the phases."""
+        """Run one environment step in a single launch, for few particles; with ``order_step`` at least 0,
+        sort them first as :meth:`sort`. Resident threads synchronise at barriers between the phases, because
+        launches would take longer than the phases."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
+            if ti.static(self.sorts):
+                if order_step >= 0:
+                    for turn in range(self.turns_of(w, self.resident_threads, self.particle_threads)):
+                        self.count_thread(source, source_slot, w + turn * self.resident_threads, stamp - 1)
+                    self.barrier_all(w)
+                    for turn in range(
+                        self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))
+                    ):
+                        self.offset_thread(w, w + turn * self.resident_threads)
+                    self.barrier_all(w)
+                    for turn in range(self.turns_of(w, self.resident_threads, self.particle_threads)):
+                        self.key_thread(source, source_slot, numbers, w + turn * self.resident_threads)
+                    self.barrier_all(w)
+                    for turn in range(self.turns_of(w, self.resident_threads, self.particle_threads)):
+                        self.order_thread(moves, order_step, w + turn * self.resident_threads)
+                    for turn in range(
+                        self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))
+                    ):
+                        self.clear_count(w + turn * self.resident_threads)
+                    self.barrier_all(w)
+                    for turn in range(self.turns_of(w, self.resident_threads, self.particle_threads)):
+                        q = w + turn * self.resident_threads
+                        self.order_number(numbers, after, moves, order_step, q)
+                        self.move_particle(source, source_slot, state, slot, moves, order_step, q)
+                    if w == 0:
+                        self.block_count[0] = 0
+                    self.barrier_all(w)
             self.set_frames(w, self.resident_threads, poses, actions, t, pose_before, pose_after)
             for s in range(self.substeps):
                 before, time = slot + s * stride, t * self.substeps + s

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from plab.sim.compiler import grid_memory_fence, ti
-from plab.sim.cuda_sums import LARGEST_MOMENTUM, gather_sums, look, variables
+from plab.sim.cuda_sums import gather_sums, look, variables
 from plab.sim.cuda_warp import (
     ALL_LANES,
     BLOCK_WARPS,
@@ -24,7 +24,7 @@ from plab.sim.cuda_warp import (
 )
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.motion import PosePhases, vec7
-from plab.sim.particle_phases import affine_field, spline, spline_slope, widen
+from plab.sim.particle_phases import spline, spline_slope, widen
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT, WORLD
 
@@ -191,10 +191,24 @@ class CudaPhases(OrderPhases, PosePhases):
         return a_bar
 
     @ti.func
+    def affine_field(self, value, last, a: ti.template(), f, scale):
+        """Affine field as value at the base node and increments, given its value (3) at the particle, its
+        fourth entry at the base node, and the matrix A (9); ``scale`` is the factor of A times the grid
+        spacing."""
+        base = variables(self.real, [value[0], value[1], value[2]])
+        columns = variables(self.real, [a[i] for i in range(9)])
+        rest = variables(self.real, [f[0], f[1], f[2], scale])
+        function = ti.static(self.function("transfers", "affine_field"))
+        function(*base, *columns, *rest)
+        zero = 0.0 * base[0]
+        x, y, z = widen(columns[:3], zero), widen(columns[3:6], zero), widen(columns[6:], zero)
+        return [widen(base, last), x, y, z]
+
+    @ti.func
     def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
         """Affine field of momentum and mass that a particle scatters, given A."""
         v = self.vector(state, source + AT_V, lane)
-        return affine_field(self.mass * v, self.mass, a, fx, self.dx)
+        return self.affine_field(self.mass * v, self.mass, a, fx, self.dx)
 
     @ti.func
     def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
@@ -203,7 +217,7 @@ class CudaPhases(OrderPhases, PosePhases):
         x_bar = self.vector(bar, target, lane)
         v_bar = self.velocity_adjoint(x, v, x_bar, self.vector(bar, target + AT_V, lane))
         c_bar = self.load(bar, target + AT_C, lane, 9)
-        return affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx)
+        return self.affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx)
 
     # -- material ------------------------------------------------------------------------------------
 
@@ -226,25 +240,19 @@ class CudaPhases(OrderPhases, PosePhases):
                 f_new = variables(self.real, self.load(state, source + AT_F, lane, 9))
                 coefficients = variables(self.real, [p[i] for i in range(self.laws[number].size)])
                 constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+                ends = variables(self.real, ti.static(self.range_of_series(number)))
                 function = ti.static(self.function(number, "particle"))
-                served = ti.cast(1.0, self.real)
-                if ti.static(self.scheduled(number)):
-                    ends = variables(self.real, ti.static(self.range_of_series()))
-                    function(*a, *f_new, *coefficients, *constants, *ends, served)
-                else:
-                    function(*a, *f_new, *coefficients, *constants)
-                if served > 0.0:
-                    for i in ti.static(range(9)):
-                        out[i] = a[i]
-                        if ti.static(update):
-                            state[target + AT_F + i][lane] = f_new[i]
-                else:
-                    if ti.static(self.scheduled(number)):
-                        out = self.spectral_material(state, source, target, lane, e, update)
+                function(*a, *f_new, *coefficients, *constants, *ends)
+                for i in ti.static(range(9)):
+                    out[i] = a[i]
+                    if ti.static(update):
+                        state[target + AT_F + i][lane] = f_new[i]
         return out
 
-    def range_of_series(self) -> list[float]:
-        return [self.series.z_squared_max, self.series.j_min, self.series.j_max]
+    def range_of_series(self, number: int) -> list[float]:
+        """Return the range of a law's series, if it has one."""
+        ends = [self.series.z_squared_max, self.series.j_min, self.series.j_max]
+        return ends if self.scheduled(number) else []
 
     @ti.func
     def material_particle_adjoint(
@@ -262,25 +270,17 @@ class CudaPhases(OrderPhases, PosePhases):
                 )
                 p_bar = variables(self.real, [p[i] for i in range(self.laws[number].size)])
                 constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+                ends = variables(self.real, ti.static(self.range_of_series(number)))
                 function = ti.static(self.function(number, "particle_adjoint"))
-                served = ti.cast(1.0, self.real)
-                if ti.static(self.scheduled(number)):
-                    ends = variables(self.real, ti.static(self.range_of_series()))
-                    function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
-                else:
-                    function(*c_out, *f_out, *a, *b, *p_bar, *constants)
-                if served > 0.0:
-                    if ti.static(self.full_gradient):
-                        if ti.static(self.mixed):
-                            self.accumulate_particle(e, source, lane, p_bar)
-                        else:
-                            self.accumulate_material(e, p_bar)
-                    for i in ti.static(range(9)):
-                        bar[target + AT_C + i][lane] = c_out[i]
-                        bar[target + AT_F + i][lane] = f_out[i]
-                else:
-                    if ti.static(self.scheduled(number)):
-                        self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
+                function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends)
+                if ti.static(self.full_gradient):
+                    if ti.static(self.mixed):
+                        self.accumulate_particle(e, source, lane, p_bar)
+                    else:
+                        self.accumulate_material(e, p_bar)
+                for i in ti.static(range(9)):
+                    bar[target + AT_C + i][lane] = c_out[i]
+                    bar[target + AT_F + i][lane] = f_out[i]
 
     @ti.func
     def accumulate_material(self, row, bars: ti.template()):
@@ -499,7 +499,7 @@ class CudaPhases(OrderPhases, PosePhases):
         rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
         field = self.momentum_field(state, source, a, lane, fx)
         if ti.static(self.deterministic):
-            fits = self.largest_share(field) < LARGEST_MOMENTUM * self.mass
+            fits = self.largest_share(field) < self.largest_momentum
             if node >= 0 and not fits and self.fault[e] == 0:
                 self.fault[e] = time + 1
         w = spline(fx)

@@ -2,8 +2,8 @@
 
 Floating-point sums depend on the order of additions, which depends on timing. Sums of integers do not. A
 *deterministic* simulator therefore uses fixed point: scattered values are 64-bit integers, with units fine
-enough for float32; float64 sums consist of several integers with different units, which represent any number
-to about 1e-29.
+enough for float32, and two of them with different units in float64; sums over particles consist of several
+integers, which represent any number to about 1e-29.
 
 Bitcode replaces code that Taichi compiles slowly or inefficiently. Taichi's atomic addition does not assume
 global memory and returns the old value, which costs time; ``codegen/cuda_global.ll`` avoids both. A law and
@@ -23,13 +23,20 @@ from plab.sim.storage import Storage
 MOMENTUM_BITS, MASS_BITS = 36, 42
 """Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""
 
-LARGEST_MOMENTUM = 2.0**13
-"""Largest contribution of a particle to a node's momentum [particle mass x domain units / s], of which 2^13
-can be added; larger values occur only in diverged states."""
+MOMENTUM_RANGE = 13
+"""Bits before the point of a particle's contribution to a node's momentum, of which 2^13 can be added; larger
+values occur only in diverged states."""
 
 ADJOINT_BITS = 46
 """Bits of a contribution to a node's adjoint, relative to the largest of the environment: 2^15 largest ones
 can be added."""
+
+REST_BITS = 49
+"""Bits of a float64 simulator's second integer, for the remainders of the first, of which 2^14 can be
+added."""
+
+WIDER = 24
+"""Bits that float64 has more before the point of momentum, and fewer after the point of its first integer."""
 
 WORD_UNITS = (2.0**30, 2.0**-12, 2.0**-54, 2.0**-96)
 """Units of the integers of a sum; an additional integer marks non-finite sums."""
@@ -108,7 +115,8 @@ class SumPhases(Storage):
 
     def scattered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors for :meth:`add_to_grid`."""
-        return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
+        kind = ti.i64 if self.deterministic else self.real
+        return ti.Vector.field(4 * self.words, kind, shape=nodes)
 
     def sums(self, count: int) -> ti.Field:
         """Allocate ``count`` zero-initialised float64 sums for :meth:`add_up` and :meth:`take_sum`."""
@@ -155,9 +163,19 @@ class SumPhases(Storage):
     # -- grids --------------------------------------------------------------------------------------
 
     @property
+    def words(self) -> int:
+        """Numbers per component of a scattered grid."""
+        return 2 if self.real == ti.f64 and self.deterministic else 1
+
+    @property
+    def largest_momentum(self) -> float:
+        """Largest contribution of a particle to a node's momentum."""
+        return self.mass * 2.0 ** (MOMENTUM_RANGE + WIDER * (self.words - 1))
+
+    @property
     def node_bytes(self) -> int:
         """Bytes per node of a scattered grid."""
-        return 16 if self.real == ti.f32 and not self.deterministic else 32
+        return 16 if self.real == ti.f32 and not self.deterministic else 32 * self.words
 
     @ti.func
     def node_at(self, first, node):
@@ -174,15 +192,35 @@ class SumPhases(Storage):
         """
         place = corner + ti.static(self.node_bytes // 4) * ti.cast(ti.cast(number, ti.u32), ti.u64)
         if ti.static(self.deterministic):
-            add(ti.i64, place, value * ti.select(component == 3, scale[3], scale[0]))
+            units = value * ti.select(component == 3, scale[3], scale[0])
+            add(ti.i64, place, units)
+            if ti.static(self.words > 1):
+                # Units are powers of two, so the remainder is exact.
+                rest = units - ti.cast(ti.cast(units, ti.i64), self.real)
+                add(ti.i64, place + 8, rest * ti.static(2.0**REST_BITS))
         else:
             add(self.real, place, value)
+
+    @ti.func
+    def number_at(self, grid: ti.template(), node, component):
+        """Return a component of a scattered grid [units of :meth:`add_to_grid`]."""
+        number = ti.cast(grid[node][self.words * component], self.real)
+        if ti.static(self.words > 1):
+            number += ti.cast(grid[node][self.words * component + 1], self.real) * ti.static(2.0**-REST_BITS)
+        return number
+
+    @ti.func
+    def clear_number(self, grid: ti.template(), node, component):
+        """Set a component of a scattered grid to 0."""
+        for word in ti.static(range(self.words)):
+            grid[node][self.words * component + word] = 0
 
     @ti.func
     def momentum_scale(self, power: ti.template()):
         """Units of momentum (3) and mass per 1, as a 4-vector; the inverse for ``power`` -1."""
         exponent = ti.static(-math.floor(math.log2(self.mass)))
-        momentum = ti.cast(ti.static(2.0 ** (power * (MOMENTUM_BITS + exponent))), self.real)
+        bits = ti.static(MOMENTUM_BITS - WIDER * (self.words - 1) + exponent)
+        momentum = ti.cast(ti.static(2.0 ** (power * bits)), self.real)
         mass = ti.cast(ti.static(2.0 ** (power * (MASS_BITS + exponent))), self.real)
         return ti.Vector([momentum, momentum, momentum, mass])
 
@@ -204,7 +242,7 @@ class SumPhases(Storage):
     @ti.func
     def largest_share(self, field: ti.template()):
         """Return an upper bound on the contributions of the first three components of an affine field, see
-        :func:`plab.sim.particle_phases.affine_field`; non-finite if a component is."""
+        :meth:`plab.sim.cuda_phases.CudaPhases.affine_field`; non-finite if a component is."""
         total = ti.abs(field[0]) + 2.0 * (ti.abs(field[1]) + ti.abs(field[2]) + ti.abs(field[3]))
         return total[0] + total[1] + total[2]
 

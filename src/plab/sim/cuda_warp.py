@@ -148,11 +148,12 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         taken = ti.Vector.zero(self.real, 4)
         for turn in ti.static(range(4)):
             node = e * self.nodes + self.linear_in_block(block, r - lane + turn * 8 + lane // 4)
-            taken[turn] = ti.cast(grid[node][lane % 4], self.real)
+            taken[turn] = self.number_at(grid, node, lane % 4)
         for turn in ti.static(range(4)):
             near = turn * 8 + lane // 4
             shared[corner + near * NODE_STRIDE + lane % 4] = taken[turn]
-            grid[e * self.nodes + self.linear_in_block(block, r - lane + near)][lane % 4] = 0
+            node = e * self.nodes + self.linear_in_block(block, r - lane + near)
+            self.clear_number(grid, node, lane % 4)
         self.wait_for_warp()
         out = ti.Vector.zero(self.real, 4)
         for c in ti.static(range(4)):
@@ -436,17 +437,88 @@ class OrderPhases(WarpPhases):
             after += 1
         return ti.select(after - begin > LARGEST_CELL, place, begin + below)
 
+    @ti.func
+    def count_thread(self, state: ti.template(), slot, q, stamp):
+        """Count thread q's particle."""
+        e, particle = self.particle_of(q)
+        if particle < self.particles:
+            base = self.cell_of(state, slot, e, particle)
+            node, part, row = self.counted(e, base)
+            self.cell_place[q] = ti.atomic_add(self.cell_count[node], 1)
+            ti.atomic_add(self.part_count[part], 1)
+            ti.atomic_add(self.row_count[row], 1)
+            block, _crossing = self.block_of(base)
+            self.list_block(e * self.blocks + block, stamp)
+
+    @ti.func
+    def offset_thread(self, w, q):
+        """Convert the count of node q of the active blocks to a place: after those of earlier rows, of
+        earlier parts of the row and of earlier cells of the part, which all lanes of the warp have."""
+        e, block, r = self.node_of(q)
+        node, part, row = self.counted(e, self.node_of_block(block, r))
+        lane, own_row = w % WARP, row % self.rows
+        own_part = part % self.count_parts % ti.static(1 << self.row_bits)
+        before = 0
+        for k in range((own_row - lane + WARP - 1) // WARP):
+            before += self.row_count[row - own_row + lane + k * WARP]
+        for k in range((own_part - lane + WARP - 1) // WARP):
+            before += self.part_count[part - own_part + lane + k * WARP]
+        for k in ti.static(range(RUN_BITS)):
+            before += ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), before, 1 << k)
+        count = self.cell_count[node]
+        upto = count
+        for k in ti.static(range(RUN_BITS)):
+            below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
+            if lane >= (1 << k):
+                upto += below
+        self.cell_count[node] = before + upto - count
+
+    @ti.func
+    def key_thread(self, state: ti.template(), slot, numbers: ti.template(), q):
+        """Write cell and number of thread q's particle to a place of its cell."""
+        e, particle = self.particle_of(q)
+        if particle < self.particles:
+            cell = self.linear(self.cell_of(state, slot, e, particle))
+            place = self.cell_count[e * self.nodes + cell] + self.cell_place[q]
+            self.cell_place[q] = place
+            key = (ti.cast(cell, ti.i64) << 32) | ti.cast(numbers[q], ti.i64)
+            self.cell_key[q - particle + place] = key
+
+    @ti.func
+    def order_thread(self, moves: ti.template(), t, q):
+        """Write the place of thread q's particle in the new order."""
+        _e, particle = self.particle_of(q)
+        place = particle
+        if particle < self.particles:
+            place = self.place_in_cell(q - particle, self.cell_place[q])
+        moves[t * self.particle_threads + q - particle + place] = particle
+
+    @ti.func
+    def clear_count(self, q):
+        """Clear the counts of node q of the active blocks."""
+        e, block, r = self.node_of(q)
+        node, part, row = self.counted(e, self.node_of_block(block, r))
+        self.cell_count[node] = 0
+        self.part_count[part] = 0
+        self.row_count[row] = 0
+
+    @ti.func
+    def order_number(self, numbers: ti.template(), after: ti.template(), moves: ti.template(), t, q):
+        """Write the number of the particle at thread q's place in the order of step t."""
+        _e, place = self.particle_of(q)
+        after[q] = numbers[q - place + moves[t * self.particle_threads + q]]
+
     @ti.kernel
     def sort(
         self,
-        state: Array,
-        slot: ti.i32,
-        target: Array,
-        target_slot: ti.i32,
+        source: Array,
+        source_slot: ti.i32,
         numbers: Array,
         after: Array,
         moves: Array,
         t: ti.i32,
+        target: Array,
+        target_slot: ti.i32,
         stamp: ti.i32,
     ):
         """Sort the particles of a time slot by block, cell and number, into another slot or array.
@@ -455,67 +527,25 @@ class OrderPhases(WarpPhases):
         previous order ``numbers``.
         """
         for q in range(self.particle_threads):
-            e, particle = self.particle_of(q)
-            if particle < self.particles:
-                base = self.cell_of(state, slot, e, particle)
-                node, part, row = self.counted(e, base)
-                self.cell_place[q] = ti.atomic_add(self.cell_count[node], 1)
-                ti.atomic_add(self.part_count[part], 1)
-                ti.atomic_add(self.row_count[row], 1)
-                block, _crossing = self.block_of(base)
-                self.list_block(e * self.blocks + block, stamp)
+            self.count_thread(source, source_slot, q, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
-                e, block, r = self.node_of(w + turn * self.node_threads)
-                node, part, row = self.counted(e, self.node_of_block(block, r))
-                # Convert the counts of a warp's cells to places, after those of earlier rows and of earlier
-                # parts of this row.
-                lane, own_row = w % WARP, row % self.rows
-                own_part = part % self.count_parts % ti.static(1 << self.row_bits)
-                before = 0
-                for k in range((own_row - lane + WARP - 1) // WARP):
-                    before += self.row_count[row - own_row + lane + k * WARP]
-                for k in range((own_part - lane + WARP - 1) // WARP):
-                    before += self.part_count[part - own_part + lane + k * WARP]
-                for k in ti.static(range(RUN_BITS)):
-                    before += ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), before, 1 << k)
-                count = self.cell_count[node]
-                upto = count
-                for k in ti.static(range(RUN_BITS)):
-                    below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
-                    if lane >= (1 << k):
-                        upto += below
-                self.cell_count[node] = before + upto - count
+                self.offset_thread(w, w + turn * self.node_threads)
         for q in range(self.particle_threads):
-            e, particle = self.particle_of(q)
-            if particle < self.particles:
-                cell = self.linear(self.cell_of(state, slot, e, particle))
-                place = self.cell_count[e * self.nodes + cell] + self.cell_place[q]
-                self.cell_place[q] = place
-                key = (ti.cast(cell, ti.i64) << 32) | ti.cast(numbers[q], ti.i64)
-                self.cell_key[q - particle + place] = key
+            self.key_thread(source, source_slot, numbers, q)
         for w in range(self.particle_threads + self.node_threads):
             if w < self.particle_threads:
-                e, particle = self.particle_of(w)
-                place = particle
-                if particle < self.particles:
-                    place = self.place_in_cell(w - particle, self.cell_place[w])
-                moves[t * self.particle_threads + w - particle + place] = particle
+                self.order_thread(moves, t, w)
             else:
                 q = w - self.particle_threads
                 for turn in range(self.turns_of(q, self.node_threads, self.nodes_in(self.block_count))):
-                    e, block, r = self.node_of(q + turn * self.node_threads)
-                    node, part, row = self.counted(e, self.node_of_block(block, r))
-                    self.cell_count[node] = 0
-                    self.part_count[part] = 0
-                    self.row_count[row] = 0
+                    self.clear_count(q + turn * self.node_threads)
         for q in range(self.particle_threads):
-            _e, place = self.particle_of(q)
             if q == 0:
                 self.block_count[0] = 0
-            after[q] = numbers[q - place + moves[t * self.particle_threads + q]]
-            self.move_particle(state, slot, target, target_slot, moves, t, q)
+            self.order_number(numbers, after, moves, t, q)
+            self.move_particle(source, source_slot, target, target_slot, moves, t, q)
 
     @ti.func
     def move_particle(

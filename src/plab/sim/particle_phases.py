@@ -1,5 +1,4 @@
-"""Particle phases of a substep common to both devices: state access, stencils, and the material update by
-singular values.
+"""Particle phases of a substep common to both devices: access to states and materials, and stencils.
 
 Transfers between a particle and its 27 grid nodes use quadratic B-splines and fields that are affine around
 the particle (APIC, moving least squares). Such a field is a 4-vector at the base node and three increments,
@@ -12,15 +11,7 @@ from typing import Any
 from plab.scenes import LAWS
 from plab.sim.codegen.bitcode import bitcode_file, symbol
 from plab.sim.compiler import bitcode_function, ti
-from plab.sim.spectral import (
-    product,
-    product_nt,
-    product_tn,
-    spectral_parameter_adjoint,
-    spectral_return_map,
-    spectral_return_map_adjoint,
-)
-from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, BYTES, GROUND, STATE, STATE_MASK, Storage
+from plab.sim.storage import AT_F, BLOCK, BLOCK_BITS, BYTES, GROUND, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
 
 TYPE_SUFFIXES = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
@@ -45,32 +36,6 @@ def widen(v: ti.template(), last):
     return ti.Vector([v[0], v[1], v[2], last])
 
 
-@ti.func
-def column(a: ti.template(), j: ti.template(), scale):
-    """Column j of a row-major 3x3 tuple, scaled, as a 4-vector padded with 0."""
-    return ti.Vector([scale * a[j], scale * a[3 + j], scale * a[6 + j], 0.0 * a[j]])
-
-
-@ti.func
-def at_base(value, row: ti.template(), f: ti.template(), scale):
-    """One component of an affine field at the base node, given its value at the particle and its row of the
-    matrix A; ``scale`` is the factor of A times the grid spacing. Takes numbers or lanes."""
-    return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
-
-
-@ti.func
-def affine_field(value, last, a: ti.template(), f, scale):
-    """Affine field as value at the base node and increments, given its value (3) at the particle, its fourth
-    entry at the base node, and the matrix A (9); ``scale`` is the factor of A times the grid spacing."""
-    base = [at_base(value[i], [a[3 * i], a[3 * i + 1], a[3 * i + 2]], f, scale) for i in range(3)]
-    return [widen(base, last), column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
-
-
-@ti.func
-def as_matrix(a: ti.template()):
-    return ti.Matrix([[a[0], a[1], a[2]], [a[3], a[4], a[5]], [a[6], a[7], a[8]]])
-
-
 class ParticlePhases(Storage):
     """Material update, particle-to-grid and grid-to-particle transfers and their adjoints.
 
@@ -90,8 +55,7 @@ class ParticlePhases(Storage):
         return bitcode_function(path, symbol(part, name, TYPE_SUFFIXES[real] if real else precision))
 
     def scheduled(self, number: int) -> bool:
-        """Return True if a law has a special schedule, which uses singular values outside the range of its
-        series."""
+        """Return True if a law has a special schedule in the range of its series."""
         return self.laws[number] is LAWS["von_mises"]
 
     # -- access to the particle state ---------------------------------------------------------------
@@ -234,54 +198,6 @@ class ParticlePhases(Storage):
         """Add one particle's contribution to the adjoint of its body's material."""
         body = self.place_body[self.place_of(entry)][lane]
         self.accumulate_material(grid_index * self.materials + body, bars)
-
-    @ti.func
-    def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
-        """Update one particle under von Mises plasticity by singular values; return A, row by row."""
-        p = self.parameters_of_particle(e, source, lane)
-        c = as_matrix(self.load(state, source + AT_C, lane, 9))
-        f = as_matrix(self.load(state, source + AT_F, lane, 9))
-        f_new, tau = spectral_return_map(f + self.dt * product(c, f), p[0], p[1], p[2])
-        out = ti.Vector.zero(self.real, 9)
-        for i in ti.static(range(9)):
-            if ti.static(update):
-                state[target + AT_F + i][lane] = f_new[i // 3, i % 3]
-            out[i] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
-        return out
-
-    @ti.func
-    def spectral_material_adjoint(
-        self,
-        state: ti.template(),
-        source,
-        bar: ti.template(),
-        target,
-        a_bar9: ti.template(),
-        lane,
-        e,
-        grid_index,
-    ):
-        """Adjoint of :meth:`spectral_material`, given the adjoint of A."""
-        p = self.parameters_of_particle(e, source, lane)
-        c = as_matrix(self.load(state, source + AT_C, lane, 9))
-        f = as_matrix(self.load(state, source + AT_F, lane, 9))
-        f_new_bar = as_matrix(self.load(bar, target + AT_F, lane, 9))
-        a_bar = as_matrix(a_bar9)
-        tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
-        tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
-        g = f + self.dt * product(c, f)
-        g_bar = spectral_return_map_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
-        if ti.static(self.full_gradient):
-            mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
-            if ti.static(self.mixed):
-                self.accumulate_particle(grid_index, target, lane, [mu_bar, lam_bar, yield_bar])
-            else:
-                self.accumulate_material(grid_index, [mu_bar, lam_bar, yield_bar])
-        c_bar = self.dt * product_nt(g_bar, f) + self.mass * a_bar
-        f_bar = g_bar + self.dt * product_tn(c, g_bar)
-        for i in ti.static(range(9)):
-            bar[target + AT_C + i][lane] = c_bar[i // 3, i % 3]
-            bar[target + AT_F + i][lane] = f_bar[i // 3, i % 3]
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 

@@ -156,17 +156,6 @@ class Particles:
         copy_numbers(copy, 0, self.numbers, self.places, 1)
         return copy
 
-    def sort(
-        self, state: ti.Ndarray, slot: int, to: ti.Ndarray, to_slot: int, t: int, moves: ti.Ndarray | None
-    ) -> None:
-        """Sort a state by cell into another array or time slot, and make this the current order. ``moves``,
-        by default an array for step 0, is written for step t."""
-        t, moves = (0, self._moves) if moves is None else (t, moves)
-        stamp, after = self.new_stamps(1), self._spare_numbers
-        self.engine.sort(state, slot, to, to_slot, self.numbers, after, moves, t, stamp)
-        self.numbers, self._spare_numbers = after, self.numbers
-        self._changed = True
-
     # -- steps --------------------------------------------------------------------------------------
 
     def new_stamps(self, count: int) -> int:
@@ -191,10 +180,10 @@ class Particles:
     ) -> None:
         """Advance the current state by environment step t, in place, from one entry of the pose history to
         another; ``moves`` stores the particle order of the step if it is needed later."""
-        if self.engine.sorts:
-            self.sort(self.current, 0, self._spare, 0, t, moves)
+        order = (self.current, 0, moves) if self.engine.sorts else None
+        if order:
             self.current, self._spare = self._spare, self.current
-        self.advance(self.current, 0, 0, poses, actions, t, entries)
+        self.advance(self.current, 0, 0, poses, actions, t, entries, order)
 
     def advance(
         self,
@@ -205,11 +194,25 @@ class Particles:
         actions: ti.Ndarray,
         t: int,
         entries: tuple[int, int],
+        order: tuple[ti.Ndarray, int, ti.Ndarray | None] | None = None,
     ) -> None:
         """Run environment step t from a time slot of ``state``, advancing by ``stride`` slots per substep (0:
-        in place)."""
-        stamp = self.new_stamps(self.engine.substeps)
-        self.engine.step(state, poses, actions, slot, stride, t, *entries, stamp)
+        in place).
+
+        With ``order``, the particles are first sorted by cell into this slot, from another array or slot,
+        which come first; the permutation is written for step t to the last array, or if this is None for step
+        0 to an own one.
+        """
+        stamp = self.new_stamps(self.engine.substeps + 1) + 1
+        motion = (state, poses, actions, slot, stride, t, *entries, stamp)
+        if order is None:
+            self.engine.step(*motion)
+            return
+        source, source_slot, moves = order
+        moves, row = (self._moves, 0) if moves is None else (moves, t)
+        before, self.numbers, self._spare_numbers = self.numbers, self._spare_numbers, self.numbers
+        self.engine.step(*motion, (source, source_slot, before, self.numbers, moves, row))
+        self._changed = True
 
     def losses(self, terms: ti.Ndarray, at: int, state: ti.Ndarray | None = None, slot: int = 0) -> None:
         """Write the measures of a state, the current one by default, to ``terms`` from entry ``at``."""

@@ -144,8 +144,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
             arch=ti.cuda if device == "cuda" else ti.cpu,
             default_fp=ti.f32 if precision == "float32" else ti.f64,
             cpu_max_num_threads=wanted,
-            # Square roots in float64 on CUDA lose digits under fast_math.
-            fast_math=device == "cpu" or precision == "float32",
+            # On CUDA, rounding would depend on the kernel, and square roots in float64 would lose digits.
+            fast_math=device == "cpu",
             # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of
             # them asserts.
             advanced_optimization=False,

@@ -80,7 +80,7 @@ class Simulator:
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
         full_gradient: bool = False,
-        deterministic: bool = False,
+        deterministic: bool = True,
         impulses: bool = False,
         _singular_values: bool = False,
     ) -> None:
@@ -99,7 +99,7 @@ class Simulator:
                 (:meth:`state_gradient`), the material (:meth:`material_gradient`), gravity and friction
                 (:meth:`world_gradient`).
             deterministic: Whether CUDA is bitwise reproducible, independent of the batch, see
-                :mod:`plab.sim.cuda_sums`; the CPU always is.
+                :mod:`plab.sim.cuda_sums`; False is faster. The CPU always is.
             impulses: Whether :meth:`step` sums the impulses on the manipulators (:meth:`impulses`).
             _singular_values: Whether to use singular values for all strains instead of series for small ones;
                 for accuracy benchmarks.

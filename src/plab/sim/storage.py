@@ -104,7 +104,7 @@ class Storage:
         scenes: Sequence[Scene],
         runtime: Runtime,
         full_gradient: bool = False,
-        deterministic: bool = False,
+        deterministic: bool = True,
         singular_values: bool = False,
     ) -> None:
         """Allocate the fields of forward simulation for scenes that differ only in per-environment data,

@@ -179,12 +179,10 @@ class Tape:
         if number and not step:
             end = self._reach * self._slots_per_step
             self._engine.copy_slot(self._history[number - 1], end, history, 0)
-        if self._engine.sorts:
-            if known:
-                self._engine.move(history, slot - 1, history, slot, self._moves, t)
-            else:
-                self._particles.sort(history, slot - 1, history, slot, t, self._moves)
-        self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1))
+        order = (history, slot - 1, self._moves) if self._engine.sorts and not known else None
+        if self._engine.sorts and known:
+            self._engine.move(history, slot - 1, history, slot, self._moves, t)
+        self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1), order)
 
     def _entry(self, t: int) -> int:
         """First entry of the measures after step t."""

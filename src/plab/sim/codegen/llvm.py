@@ -1,7 +1,7 @@
 """Code generation in LLVM's intermediate representation, by tracing arithmetic operators.
 
 A :class:`Number` is a value of all lanes of a tile on the CPU, or of one particle on CUDA. Products and sums
-may be fused, which Taichi does not allow on CPUs.
+are fused, which Taichi does not allow on CPUs.
 """
 
 from __future__ import annotations
@@ -260,7 +260,46 @@ class Code:
 
 
 class Scalars(Code):
-    """A function on the numbers of one particle, with parts that may be skipped at run time."""
+    """A function on the numbers of one particle, with parts that may be skipped at run time.
+
+    The compiler would fuse different products in different kernels, so they are fused here, and other
+    products are instructions that it does not know.
+    """
+
+    def __init__(self, *function: Any, **options: bool) -> None:
+        super().__init__(*function, **options)
+        # Factors of the products that additions can absorb.
+        self._factors: dict[ir.Value, tuple[ir.Value, ir.Value]] = {}
+
+    def add(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        for one, other in ((a, b), (b, a)):
+            if one in self._factors:
+                return self._b.fma(*self._factors[one], other)
+        return self._b.fadd(a, b)
+
+    def sub(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        if a not in self._factors and b in self._factors:
+            left, right = self._factors[b]
+            return self._b.fma(self.minus(left), right, a)
+        return self.add(a, self.minus(b)) if a in self._factors else self._b.fsub(a, b)
+
+    def mul(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        out = self.product(a, b)
+        self._factors[out] = a, b
+        return out
+
+    def product(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        kind = ir.FunctionType(self.real, [self.real] * 2)
+        code, register = ("mul.rn.ftz.f32", "f") if self.single else ("mul.rn.f64", "d")
+        return self._b.asm(kind, f"{code} $0, $1, $2;", f"={register},{register},{register}", (a, b), False)
+
+    def div(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        if not self.single:
+            return self._b.fdiv(a, b)
+        # The compiler would combine a quotient with a root in the divisor.
+        name, kind = "llvm.nvvm.div.approx.ftz.f", ir.FunctionType(self.real, [self.real] * 2)
+        known = self._b.module.globals.get(name)
+        return self._b.call(known or ir.Function(self._b.module, kind, name), (a, b))
 
     def constant(self, number: float) -> ir.Value:
         return self.real(number)
@@ -269,12 +308,12 @@ class Scalars(Code):
         """Return the conjunction of conditions."""
         return reduce(self._b.and_, conditions)
 
-    def flag(self, condition: ir.Value) -> ir.Value:
-        """1 if a condition is met, else 0."""
-        return self._b.uitofp(condition, self.real)
-
     def where(self, condition: ir.Value) -> AbstractContextManager[Any]:
         return self._b.if_then(condition)
+
+    def either(self, condition: ir.Value) -> AbstractContextManager[Any]:
+        """Return the contexts of two parts, executed if a condition is met and if not."""
+        return self._b.if_else(condition)
 
     def variables(self, values: Sequence[ir.Value]) -> list[ir.Value]:
         with self._b.goto_entry_block():

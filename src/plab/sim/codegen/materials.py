@@ -1,8 +1,8 @@
 """Material updates and their adjoints, for a tile of particles on the CPU and for one particle on CUDA.
 
-Any law is an update from C and F to A and the new F, and its adjoint, traced. von Mises plasticity has a
-special schedule with several parts: tiles without yielding particles skip plastic flow, the adjoint reuses
-the strain of the forward part, and strains outside the range of the series use singular values.
+Any law is an update from C and F to A and the new F, and its adjoint, traced. von Mises plasticity also has a
+special schedule with several parts, for strains in the range of its series: tiles without yielding particles
+skip plastic flow, and the adjoint reuses the strain of the forward part.
 
 Adjoints have the suffix ``_bar``.
 """
@@ -151,8 +151,8 @@ def strain_adjoint(
 CONSTANTS = "dt stress_scale mass"
 """Numbers of an update and its adjoint."""
 
-RANGE = "z_squared_max j_min j_max served"
-"""Range of the series, and whether it applies."""
+RANGE = "z_squared_max j_min j_max"
+"""Range of the series."""
 
 
 TILE_PLACES = {
@@ -368,8 +368,8 @@ def copy(source: str, target: str, tile: Tile) -> None:
 
 
 SCHEDULE: dict[str, tuple[Callable[..., None], str, str]] = {
-    "strain": (partial(tile_strain, False), "source", f"dt {RANGE}"),
-    "whole_strain": (partial(tile_strain, True), "source", f"dt {RANGE}"),
+    "strain": (partial(tile_strain, False), "source", f"dt {RANGE} served"),
+    "whole_strain": (partial(tile_strain, True), "source", f"dt {RANGE} served"),
     "stress": (tile_stress, "source affine", "stress_scale mass rigid"),
     "flow": (tile_flow, "target", ""),
     "rest": (partial(copy, "g", "f_new"), "target", ""),
@@ -378,46 +378,49 @@ SCHEDULE: dict[str, tuple[Callable[..., None], str, str]] = {
     "rest_adjoint": (partial(copy, "f_new_bar", "g_bar"), "bar", ""),
     "strain_adjoint": (tile_strain_adjoint, "source affine bar", "dt mass"),
 }
-"""Parts of the update of a tile: writer, addresses and numbers. If no lane yields, ``rest`` replaces
-``flow``."""
+"""Parts of the update of a tile: writer, addresses and numbers. ``served`` is 0 if a lane is outside the
+range of the series. If no lane yields, ``rest`` replaces ``flow``."""
 
 
-def particle(one: Particle) -> None:
-    """Write A in place of C and the new F in place of F; unchanged outside the range of the series."""
+def particle(law: Law, one: Particle) -> None:
+    """Write A in place of C and the new F in place of F."""
     code, (mu, lam, limit) = one.code, one.take("p")
     g, j, (c2, _w, _z, _z2, _a1, _a2, d), fits = strain(one)
-    served = code.all_of(*fits)
-    code.put("served", code.flag(served))
-    with code.where(served):
-        tau = von_mises.stress(d, j, c2, mu, lam, limit, one.series)
-        one.leave("a", scattered_matrix(tau, one.take("c"), one.number("stress_scale"), one.number("mass")))
-        one.leave("f_new", g)
-        with code.where(one.is_yielding(d, limit)):
-            one.leave("f_new", von_mises.flow(d, g, limit, one.series))
+    with code.either(code.all_of(*fits)) as (inside, outside):
+        with inside:
+            tau = von_mises.stress(d, j, c2, mu, lam, limit, one.series)
+            scale, mass = one.number("stress_scale"), one.number("mass")
+            one.leave("a", scattered_matrix(tau, one.take("c"), scale, mass))
+            one.leave("f_new", g)
+            with code.where(one.is_yielding(d, limit)):
+                one.leave("f_new", von_mises.flow(d, g, limit, one.series))
+        with outside:
+            update(law, True, one)
 
 
-def particle_adjoint(one: Particle) -> None:
-    """Write the adjoints in place of C, F and the coefficients; unchanged outside the range of the series."""
+def particle_adjoint(law: Law, one: Particle) -> None:
+    """Write the adjoints in place of C, F and the coefficients."""
     code, a_bar, g_bar, (mu, lam, limit) = one.code, *map(one.take, ("a_bar", "f_new_bar", "p"))
     g, j, (c2, w, z, _z2, a1, a2, d), fits = strain(one)
-    served = code.all_of(*fits)
-    code.put("served", code.flag(served))
-    with code.where(served):
-        scale = one.number("stress_scale")
-        d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
-        kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
-        with code.where(one.is_yielding(d, limit)):
-            d_flow, g_flow, limit_flow = flow_adjoint(d, g, limit, g_bar, one.series)
-            sums = [x + y for x, y in zip((*d_bar, bars[2]), (*d_flow, limit_flow), strict=True)]
-            code.set_variables(kept, [x.value for x in (*sums, *g_flow)])
-        *d_bar, bars[2] = (Number(code, value) for value in code.values(kept[:7]))
-        g_bar = [Number(code, value) for value in code.values(kept[7:])]
-        known, own = [*g, j, c2, *w, *z, a1, a2, *d], [*g_bar, j_bar, c2_bar, *d_bar]
-        c, f, mass = one.take("c"), one.take("f"), one.number("mass")
-        c_out, f_out = strain_adjoint(c, f, one.number("dt"), known, own, one.series)
-        one.leave("c_bar", [x + mass * a for x, a in zip(c_out, a_bar, strict=True)])
-        one.leave("f_bar", f_out)
-        one.leave("p_bar", bars)
+    with code.either(code.all_of(*fits)) as (inside, outside):
+        with inside:
+            scale = one.number("stress_scale")
+            d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
+            kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
+            with code.where(one.is_yielding(d, limit)):
+                d_flow, g_flow, limit_flow = flow_adjoint(d, g, limit, g_bar, one.series)
+                sums = [x + y for x, y in zip((*d_bar, bars[2]), (*d_flow, limit_flow), strict=True)]
+                code.set_variables(kept, [x.value for x in (*sums, *g_flow)])
+            *d_bar, bars[2] = (Number(code, value) for value in code.values(kept[:7]))
+            g_bar = [Number(code, value) for value in code.values(kept[7:])]
+            known, own = [*g, j, c2, *w, *z, a1, a2, *d], [*g_bar, j_bar, c2_bar, *d_bar]
+            c, f, mass = one.take("c"), one.take("f"), one.number("mass")
+            c_out, f_out = strain_adjoint(c, f, one.number("dt"), known, own, one.series)
+            one.leave("c_bar", [x + mass * a for x, a in zip(c_out, a_bar, strict=True)])
+            one.leave("f_bar", f_out)
+            one.leave("p_bar", bars)
+        with outside:
+            adjoint(law, one)
 
 
 # -- all functions -------------------------------------------------------------------------------------------
@@ -435,12 +438,12 @@ def law_makers(law: Law, device: str, mixed: bool) -> dict[str, Maker]:
         }
         tiles = {
             name: (write, partial(Tile, law, mixed, addresses, numbers))
-            for name, (write, addresses, numbers) in (SCHEDULE if scheduled else parts).items()
+            for name, (write, addresses, numbers) in (parts | SCHEDULE if scheduled else parts).items()
         }
         return {name: partial(_made, *part) for name, part in tiles.items()}
     numbers = f"{CONSTANTS} {RANGE}" if scheduled else CONSTANTS
-    forward = particle if scheduled else partial(update, law, True)
-    back = particle_adjoint if scheduled else partial(adjoint, law)
+    forward = partial(particle, law) if scheduled else partial(update, law, True)
+    back = partial(particle_adjoint if scheduled else adjoint, law)
     return {
         "particle": partial(_made, forward, partial(Particle, f"c9 f9 p{law.size}", numbers)),
         "particle_adjoint": partial(_made, back, partial(Particle, f"c9 f9 a9 b9 p{law.size}", numbers)),

@@ -220,6 +220,17 @@ def gather_sums(module: ir.Module, name: str, real: ir.Type) -> None:
     code.end()
 
 
+def affine_field(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Affine field as value ``v`` at the base node, in place of that at the particle, and increments in place
+    of the matrix ``m``, given the particle's offset ``o`` and the factor ``scale`` of the matrix times the
+    grid spacing."""
+    one = Particle("v3 m9 o3", "scale", module, name, real)
+    v, m, offset, scale = one.take("v"), one.take("m"), one.take("o"), one.number("scale")
+    one.leave("v", [v[i] - scale * _dot(offset, m[3 * i : 3 * i + 3]) for i in range(3)])
+    one.leave("m", [scale * m[3 * i + j] for j in range(3) for i in range(3)])
+    one.code.end()
+
+
 def _rows(numbers: Sequence[Number]) -> list[Sequence[Number]]:
     return [numbers[k : k + 4] for k in range(0, len(numbers), 4)]
 
@@ -241,5 +252,5 @@ def _dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
 
 
 TILE_TRANSFERS = {"scatter": scatter, "gather": gather, "gather_adjoint": gather_adjoint}
-PARTICLE_TRANSFERS = {"gather_sums": gather_sums}
+PARTICLE_TRANSFERS = {"gather_sums": gather_sums, "affine_field": affine_field}
 """Functions by name."""
