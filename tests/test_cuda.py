@@ -1,7 +1,5 @@
-"""CUDA against the CPU, which tests/test_simulator.py compares with the reference.
-
-In float64 the kernels of both devices differ only in the order of sums, so the remaining errors are rounding.
-"""
+"""CUDA against the CPU, which tests/test_simulator.py compares with the reference: in float64 only the order
+of sums differs, so the remaining errors are rounding."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ CUDA functions without warp operations are compiled for the CPU here, with the C
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -154,7 +153,7 @@ class Threads(CudaPhases):
 
 
 @pytest.fixture(scope="module")
-def pair() -> Iterator[tuple[Tiles, Threads]]:
+def pair():
     runtime = start_runtime("cpu", "float64")
     both = Tiles(SCENES, runtime, True), Threads(SCENES, runtime, True, False)
     assert both[1].batch * both[1].tiles * both[1].lanes % 32 == 0, "threads would read beyond the particles"

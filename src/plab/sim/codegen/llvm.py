@@ -266,7 +266,7 @@ class Scalars(Code):
     products are instructions that it does not know.
     """
 
-    def __init__(self, *function: Any, **options: bool) -> None:
+    def __init__(self, *function: Any, **options: Any) -> None:
         super().__init__(*function, **options)
         # Factors of the products that additions can absorb.
         self._factors: dict[ir.Value, tuple[ir.Value, ir.Value]] = {}
