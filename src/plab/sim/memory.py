@@ -25,7 +25,7 @@ ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 def environment_bytes(
     scene: Scene, precision: str, device: str, *, states: int = 3, gradient: bool = False
 ) -> int:
-    """Return a lower bound for the memory of one environment [bytes].
+    """Return a lower bound for the memory of one environment of a deterministic simulator [bytes].
 
     Args:
         scene: The scene.
@@ -35,11 +35,15 @@ def environment_bytes(
         gradient: Whether to include adjoints of the grids.
     """
     places = -(-scene.particle_count // LANES[device]) * LANES[device]
-    # Momentum by chunk and velocity, four numbers each; target mass and distance.
-    grids = _nodes(scene) * 4 * (_chunks(device) + 1) * (2 if gradient else 1) + 2 * scene.grid_size**3
+    # Momentum by chunk, on CUDA of twice the size, and velocity, four numbers each; target mass and distance.
+    scattered, nodes = CHUNKS if device == "cpu" else 2, _nodes(scene)
+    grids = nodes * 4 * (scattered + 1) * (2 if gradient else 1) + 2 * scene.grid_size**3
+    # CUDA also counts the particles of each node.
+    counts = 0 if device == "cpu" else 4 * nodes
     frames = scene.substeps * len(scene.manipulators)
     # Each particle also has 9 numbers of stress; poses are float64.
-    return (places * (states * STATE + 9) + grids + 25 * frames) * BYTES[precision] + 64 * frames
+    numbers = places * (states * STATE + 9) + grids + 25 * frames
+    return numbers * BYTES[precision] + counts + 64 * frames
 
 
 def _chunks(device: str) -> int:
