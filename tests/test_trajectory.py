@@ -151,7 +151,7 @@ def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypa
     cfg = make_config(Path(finished.config["results_dir"]))
     before = finished.path.stat().st_mtime_ns
     with monkeypatch.context() as patch:
-        patch.setattr(trajectory, "shared_problem", None)
+        patch.setattr(trajectory.TrajectoryRunner, "build", None)
         assert run_config(cfg, CACHE) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plab.config import ConfigError, MethodConfig
-from plab.runners import Family, Runner, Step, Track, measures, shared_problem
+from plab.runners import Family, Runner, Step, Track, measures
 
 __all__ = ["FAMILY", "RandomSearch", "RandomSearchConfig"]
 
@@ -40,10 +40,9 @@ class RandomSearch(Runner):
     """Random search around the best actions."""
 
     def build(self) -> None:
-        """Build scene, target and simulator."""
-        (track,) = self.tracks
-        self.problem = shared_problem(self.cache, [track.cfg])
-        self.problem.simulator.set_contact(track.cfg.method.contact, track.cfg.method.softness)
+        """Build scene, target and simulator, and set the contact model."""
+        super().build()
+        self.problem.simulator.set_contact(self.method.contact, self.method.softness)
 
     def step(self, track: Track) -> Step:
         """Evaluate one action sequence."""

@@ -253,17 +253,20 @@ def report(outcomes: Sequence[Outcome]) -> int:
 class Runner:
     """Base class of runners, which execute a batch of runs and resume them from their files.
 
-    A family overrides :meth:`build`, :meth:`step` or :meth:`iterate`, and other hooks as needed. Order of
-    calls: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any
-    :meth:`has_more`, :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
+    A family defines ``step`` or overrides :meth:`iterate`, and other hooks as needed. Order of calls:
+    :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any :meth:`has_more`,
+    :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
 
     Attributes:
+        step: Method that makes one iteration of one run; it raises SimulationError if a state, loss or
+            gradient diverges, RunError if it fails for another reason.
         tracks: The runs; a single one if runs cannot share a simulator.
         problem: Problem for evaluating the best actions, with an environment per run; set by :meth:`build`.
         cache: Simulators of earlier runs.
         report: Function of the batch's progress and a short text; see :mod:`plab.progress`.
     """
 
+    step: Callable[[Track], Step]
     problem: Problem
     report: Report
 
@@ -279,11 +282,11 @@ class Runner:
         self._phase, self._since, self._timed, self._shown = "", 0.0, self.tracks, ""
 
     # ------------------------------------------------------------------------------------------------ hooks
-    # None is abstract: a runner needs build, and step or iterate, but none of them if it overrides run.
 
     def build(self) -> None:
-        """Check that the runs can be executed, and create their shared objects, at least :attr:`problem`."""
-        raise NotImplementedError(f"{type(self).__name__} needs build")
+        """Check that the runs can be executed, and create their shared objects; by default :attr:`problem`,
+        with an environment per run."""
+        self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Create the objects of a run, from a :attr:`Step.state` when resuming."""
@@ -297,15 +300,10 @@ class Runner:
         return cast(int, row_count(asdict(track.cfg.method)))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Make the next iteration of unfinished runs; by default :meth:`step` of each. Yield the successful
+        """Make the next iteration of unfinished runs; by default :attr:`step` of each. Yield the successful
         runs; mark failed ones with :meth:`Track.fail`. The wall time is shared equally."""
         for track in tracks:
             yield track, self.step(track)
-
-    def step(self, track: Track) -> Step:
-        """Make one iteration of one run; raise SimulationError if a state, loss or gradient diverges,
-        RunError if it fails for another reason."""
-        raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
         """Release the objects of the iterations, also after a failure."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule, family
-from plab.runners.runner import Runner, Step, Track, measures, shared_problem
+from plab.runners.runner import Runner, Step, Track, measures
 
 CHECK_INTERVAL = 10
 """Interval at which the best actions since the last check are evaluated in the hard contact model
@@ -65,7 +65,7 @@ class TrajectoryRunner(Runner):
 
     def build(self) -> None:
         """Build the problem, with an environment per run."""
-        self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
+        super().build()
         self._set_contact()
         self._rules: dict[int, UpdateRule] = {}
         self._finalists: dict[int, Finalists] = {}
