@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import plab.sim.cuda_engine as cuda_engine
-from cuda_scenes import ALL, actions_of, assert_same_bits, results_of, simulator_of
+from cuda_scenes import ALL, assert_same_bits, results_of
 
 pytestmark = [pytest.mark.gpu]
 
@@ -23,16 +23,3 @@ def test_every_run_and_every_batch_has_the_same_bits(contact: str, monkeypatch: 
     # As in a large batch, with many launches per step.
     monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 0)
     assert_same_bits(*results_of(ALL, "float32", contact), want)
-
-
-def test_a_broken_state_is_still_found() -> None:
-    """Detect values that exceed a node's integers: a velocity, and unlimited stress."""
-    fast, strained = 1, 10
-    simulator = simulator_of([0, fast, strained], "float32", "nearest")
-    start = simulator.state()
-    start.v[1, 5, 0] = 1e6
-    start.F[2, 5] = 1e4 * np.eye(3)
-    simulator.set_initial_state(start)
-    result = simulator.rollout(actions_of([0, fast, strained]), strict=False)
-    assert set(result.failures) == {1, 2}
-    assert all("environment step 1, substep 1" in failure for failure in result.failures.values())

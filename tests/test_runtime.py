@@ -14,6 +14,7 @@ from plab.config import build_scene, load_config
 from plab.sim import Simulator, compiler
 from plab.sim.compiler import QUADRANTS, ti
 from plab.sim.runtime import available_threads, remove_stale_cache_lock, start_runtime
+from plab.sim.tensors import Array
 
 
 def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
@@ -79,3 +80,33 @@ def test_dropped_simulators_free_their_fields_beside_another() -> None:
     assert resident[-1] - resident[1] < 80.0
     kept.step(np.zeros((1, kept.action_dim)))
     assert np.isfinite(kept.state().x).all()
+
+
+@ti.data_oriented
+class Multiplier:
+    @ti.kernel
+    def multiply(self, values: Array, factor: ti.i32):
+        for i in values:
+            values[i] *= factor
+
+
+@pytest.mark.skipif(QUADRANTS, reason="of Taichi")
+def test_compiled_kernels_are_launched_directly(monkeypatch) -> None:
+    start_runtime("cpu", "float64")
+    multiplier, taichi = Multiplier(), ti.ndarray(ti.f64, 2)
+    taichi.from_numpy(np.ones(2))
+    for kind in (np.float64, np.float32, np.int32):
+        multiplier.multiply(np.ones(2, kind), 2)
+    multiplier.multiply(taichi, 2)
+    call, checked = compiler.Kernel.__call__, []
+    monkeypatch.setattr(compiler.Kernel, "__call__", lambda *args: (checked.append(args[2]), call(*args)))
+    for kind in (np.float32, np.float64, np.int32):
+        array = np.ones(2, kind)
+        multiplier.multiply(array, np.int64(3))
+        assert (array == 3).all() and array.dtype == kind
+    multiplier.multiply(taichi, 3)
+    assert not checked
+    with pytest.raises(ValueError, match="contiguous"):
+        multiplier.multiply(np.ones(4)[::2], 3)
+    monkeypatch.undo()
+    assert (taichi.to_numpy() == 6).all()

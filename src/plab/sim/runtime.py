@@ -212,9 +212,9 @@ def register_user(user: object) -> None:
 
 
 def own_fields(owner: object) -> None:
-    """Place the fields just declared on the CPU; if their owner no longer exists when the next simulator is
-    built, they are freed then."""
-    if _current is not None and _current.device == "cpu" and (handle := place_fields()) is not None:
+    """Place the fields just declared; if their owner no longer exists when the next simulator is built, they
+    are freed then."""
+    if _current is not None and (handle := place_fields()) is not None:
         weakref.finalize(owner, _dropped.append, (_current, handle)).atexit = False
 
 
