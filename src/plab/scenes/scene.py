@@ -359,6 +359,15 @@ class Manipulator:
         """Number of action components, 0 for a static manipulator."""
         return len(self.kind.action_names)
 
+    @property
+    def extent(self) -> float:
+        """Upper bound of the distance of its points from its position [domain units]; infinite for shapes
+        that grip between their parts."""
+        if self.kind.support is None:
+            return math.inf
+        along = [float(self.kind.support(self.size, sign * axis)) for axis in np.eye(3) for sign in (1, -1)]
+        return float(np.linalg.norm([max(along[:2]), max(along[2:4]), max(along[4:])]))
+
     def largest_step(self) -> float:
         """Upper bound of the displacement of any point of the manipulator in an environment step [domain
         units]; 0 for links, whose motion is bounded by their model."""

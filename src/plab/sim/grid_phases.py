@@ -122,9 +122,13 @@ class GridPhases(Storage):
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
         if alpha > 0.0:
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
-        p = self.into_frame(shape, e, s, m, centre - self.frame_centre[e, s, m])
-        d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-        return d <= reach
+        offset, near = centre - self.frame_centre[e, s, m], False
+        # Most blocks are outside of the ball around the manipulator.
+        if offset.norm() <= self.extent[e, m] + reach:
+            p = self.into_frame(shape, e, s, m, offset)
+            d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+            near = d <= reach
+        return near
 
     # -- contact ------------------------------------------------------------------------------------
 

@@ -128,7 +128,7 @@ class Storage:
         self.chunks = 1 if self.cuda else CHUNKS
         self.substeps = first.substeps
         # Additional threads per environment work on its chunks as a team.
-        self.threads = runtime.threads
+        self.runtime, self.threads = runtime, runtime.threads
         self.team_size = min(self.chunks, max(1, runtime.threads // self.batch))
         # Number of materials of an environment: 1, or one per body.
         self.materials = first.material_count
@@ -200,6 +200,7 @@ class Storage:
         # Floor friction and gravity (3) of each environment, and the coefficients of its first body.
         self.material = self.share(ti.Vector.field(GROUND + self.coefficients, real, shape=b))
         self.size = self.share(ti.Vector.field(3, real, shape=(b, m)))
+        self.extent = self.share(ti.field(real, shape=(b, m)))
         self.friction = self.share(ti.field(real, shape=(b, m)))
         self.scale = self.share(ti.Vector.field(7, ti.f64, shape=(b, m)))
         self.low = self.share(ti.Vector.field(3, ti.f64, shape=(b, m)))
@@ -304,6 +305,7 @@ class Storage:
             return
         tools = [tool for scene in scenes for tool in scene.manipulators]
         self.write(self.size, [[*tool.size, *[0.0] * (3 - len(tool.size))] for tool in tools])
+        self.write(self.extent, [tool.extent for tool in tools])
         self.write(self.scale, [[*tool.scale, *[0.0] * (7 - len(tool.scale))] for tool in tools])
         self.write(self.low, [tool.lower_bound for tool in tools])
         self.write(self.high, [tool.upper_bound for tool in tools])
