@@ -308,6 +308,3 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
     check(again, 36)
     add(again, 36)
     check(again, 37)
-
-
-# --------------------------------------------------------------------------------------------- who joins

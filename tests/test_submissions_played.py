@@ -257,6 +257,3 @@ def test_plans_and_policies_whose_actions_do_not_fit(tmp_path: Path, monkeypatch
         policy = load_policy("a.pt", torchscript(tmp_path / "a.pt", module))
         line = why(play, cfgs, policy, "a.pt")
         assert line.startswith("a.pt ") and fault in line
-
-
-# --------------------------------------------------------------------------------------- from start to end

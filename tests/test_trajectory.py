@@ -23,7 +23,7 @@ from plab.runners.runner import RunLog, SimulatorCache, measures, shared_problem
 from plab.runners.training import shared_batches
 from plab.runners.trajectory import UpdateRule
 from plab.sim import SimulationError, Simulator
-from same_runs import CACHE, assert_same_numbers, finished_as, run, stopped_at
+from same_runs import CACHE, assert_same_numbers, finished_as, raising, run, stopped_at
 from toy_runner import COARSE_ROPE
 
 ITERATIONS = 4
@@ -181,18 +181,6 @@ def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
     assert get("a") == 4
 
 
-def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: BaseException) -> None:
-    """Raise an error at a rollout, counted from 0."""
-    intact, calls = where.rollout, iter(range(1_000))
-
-    def rollout(self, actions, **options):
-        if next(calls) >= at:
-            raise error
-        return intact(self, actions, **options)
-
-    monkeypatch.setattr(where, "rollout", rollout)
-
-
 @pytest.mark.parametrize(
     ("at", "error", "status", "message"),
     [
@@ -203,11 +191,10 @@ def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: 
     ],
 )
 def test_resumed_run_equals_an_uninterrupted_one(
-    tmp_path: Path, finished, monkeypatch, at: int, error: type, status: str, message: str
+    tmp_path: Path, finished, at: int, error: type, status: str, message: str
 ) -> None:
     cfg = make_config(tmp_path)
-    with monkeypatch.context() as patch, pytest.raises(error):
-        break_rollout(patch, Problem, at, error("gone"))
+    with raising(error("gone"), at, Problem, "rollout"), pytest.raises(error):
         run_config(cfg, CACHE)
     left = read(cfg.path.with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == (status, message, min(at, ITERATIONS))
@@ -218,10 +205,10 @@ def test_resumed_run_equals_an_uninterrupted_one(
 
 
 @pytest.mark.parametrize(("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)])
-def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: type, raised: type) -> None:
+def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, error: type, raised: type) -> None:
     cfg = make_config(tmp_path)
-    break_rollout(monkeypatch, Simulator, 2, error("environment 0, step 2: position is nan"))
-    with pytest.raises(raised) as caught:
+    nan = error("environment 0, step 2: position is nan")
+    with raising(nan, 2, Simulator, "rollout"), pytest.raises(raised) as caught:
         run_config(cfg, CACHE)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"
     left = read(cfg.path.with_suffix(".partial.h5"))
