@@ -160,9 +160,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Keep files in one process, and those of the same task."""
     from xdist.scheduler import LoadFileScheduling
 
-    made, group = (
-        LoadFileScheduling(config, log),
-        {name: group[0] for group in (MOVE, ROPE) for name in group},
-    )
+    made = LoadFileScheduling(config, log)
+    group = {name: group[0] for group in (MOVE, ROPE) for name in group}
     made._split_scope = lambda node: group.get(file := node.split("::")[0][len("tests/test_") : -3], file)
     return made

@@ -69,15 +69,8 @@ ROTATIONS = {
 
 def manipulator(kind: str, near: bool) -> Manipulator:
     """Manipulator that touches the body, or is far away."""
-    return Manipulator(
-        kind,
-        SIZES[kind],
-        NEAR[kind] if near else FAR[kind],
-        rotation=ROTATIONS.get(kind, (1.0, 0.0, 0.0, 0.0)),
-        scale=SCALES[kind],
-        gap=0.08,
-        friction=0.5,
-    )
+    place, rotation = (NEAR if near else FAR)[kind], ROTATIONS.get(kind, (1.0, 0.0, 0.0, 0.0))
+    return Manipulator(kind, SIZES[kind], place, rotation, scale=SCALES[kind], gap=0.08, friction=0.5)
 
 
 def scene(near: tuple[str, ...], *, particles: int = 150, floor: bool = False, **changes: float) -> Scene:

@@ -17,21 +17,15 @@ ROWS = 4
 
 @functools.cache
 def _template(method: str) -> dict[str, Any]:
-    return template(
-        method, ["method.episodes=100"] if method in ("sac", "td3", "ppo") else [f"method.iterations={ROWS}"]
-    )
+    length = "method.episodes=100" if method in ("sac", "td3", "ppo") else f"method.iterations={ROWS}"
+    return template(method, [length])
 
 
 def config(folder: Path, task: str = "Rope", variant: str = "1", method: str = "adam", seed: int = 0) -> dict:
     """Return a run's configuration."""
     made = copy.deepcopy(_template(method))
-    made["task"]["name"], made["variant"], made["seed"], made["results_dir"] = (
-        task,
-        variant,
-        seed,
-        str(folder),
-    )
-    return made
+    made["task"]["name"] = task
+    return made | {"variant": variant, "seed": seed, "results_dir": str(folder)}
 
 
 def run(folder: Path, **which: Any) -> RunResult:

@@ -166,8 +166,12 @@ def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None
 
 def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     actions = draw(9).detach().numpy()
-    before = episodes.problem.evaluate_actions(actions, gradient=True)
     calls = count()
+
+    def gradient() -> np.ndarray:
+        return episodes.problem.evaluate_actions(actions, gradient=True).gradient
+
+    before = gradient()
 
     def react(t: int, bar: np.ndarray | None) -> None:
         if next(calls) == 1:
@@ -176,14 +180,10 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     episodes.reset()
     with pytest.raises(ArithmeticError):
         episodes.closed_loop(HORIZON, lambda t, seen: actions[:, 0], react, discount=0.5)
-    np.testing.assert_array_equal(
-        episodes.problem.evaluate_actions(actions, gradient=True).gradient, before.gradient
-    )
+    np.testing.assert_array_equal(gradient(), before)
     episodes.reset()
     policy_gradient(episodes, network(episodes, 6), HORIZON, discount=0.5)
-    np.testing.assert_array_equal(
-        episodes.problem.evaluate_actions(actions, gradient=True).gradient, before.gradient
-    )
+    np.testing.assert_array_equal(gradient(), before)
     episodes.reset()
     with pytest.raises(ValueError, match=r"\(4, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)

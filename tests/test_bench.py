@@ -53,17 +53,8 @@ def still(observation: np.ndarray) -> np.ndarray:
 
 def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
     table = tmp_path / "unseen.csv"
-    words = [
-        *COARSE_32,
-        "task=Move",
-        "sim.horizon=3",
-        "--scenes",
-        "3",
-        "--together",
-        "2",
-        "--csv",
-        str(table),
-    ]
+    words = [*COARSE_32, "task=Move", "sim.horizon=3"]
+    words += ["--scenes", "3", "--together", "2", "--csv", str(table)]
     assert unseen.main([*words, "--policy", "test_bench:still"]) == 0
     (row,) = read(table)
     assert (row["policy"], row["scenes"]) == ("test_bench:still", "3") and float(row["score"]) < 0.05

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
+import torch
 
 import plab
+from plab.config import load_config
+from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.scenes import Body, Camera, Manipulator, Scene
 from plab.sim import Simulator
 from plab.sim.cameras import FIRST_BODY, FIRST_MANIPULATOR, FLOOR, CameraSensor
+from suite import DEVICE
 from toy_runner import COARSE_32
 
-DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
 SIZE = 48, 40
 CAMERAS = (
     Camera((0.5, 0.8, 1.7), (0.5, 0.2, 0.5), 40.0, SIZE),
@@ -25,12 +27,9 @@ pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 
 def scene(center: tuple[float, float, float], particles: int = 4000) -> Scene:
     """A plasticine ball and a sphere next to it."""
-    return Scene(
-        "Camera",
-        (Body("sphere", center, (0.12,), particles),),
-        (Manipulator("Sphere", (0.1,), (0.2, 0.3, 0.5), scale=(0.01,) * 3),),
-        grid_size=16,
-    )
+    ball = Body("sphere", center, (0.12,), particles)
+    tool = Manipulator("Sphere", (0.1,), (0.2, 0.3, 0.5), scale=(0.01,) * 3)
+    return Scene("Camera", (ball,), (tool,), grid_size=16)
 
 
 def ball_depth(camera: Camera, center: tuple[float, float, float], radius: float) -> np.ndarray:
@@ -134,15 +133,8 @@ def test_environments_observe_by_key():
 
 
 def test_tensors_by_key_stay_on_the_device():
-    import torch
-
-    from plab.config import load_config
-    from plab.envs.core import EpisodeBatch
-    from plab.envs.tensors import TensorEnv
-
-    env = TensorEnv(
-        EpisodeBatch([load_config(["task=Move", *COARSE])] * 2, observe=["state", "rgb", "impulses"])
-    )
+    cfgs = [load_config(["task=Move", *COARSE])] * 2
+    env = TensorEnv(EpisodeBatch(cfgs, observe=["state", "rgb", "impulses"]))
     first = env.reset()
     later = env.step(torch.ones(2, env.batch.action_space.shape[0], device=env.device)).observation
     again = env.reset(environments=[1])["impulses"]

@@ -12,6 +12,8 @@ import plab.demonstrations as demonstrations
 import synthetic
 from plab.cli.suite import replay
 from plab.config import Config, build_scene, load_config
+from plab.config.suite import SUITE_VARIANTS as VARIANTS
+from plab.config.suite import suite_tasks
 from plab.demonstrations import known_actions, load_actions
 from plab.report.tables import demonstration_scores
 from plab.results import config_dict
@@ -21,12 +23,9 @@ from record_demonstrations import action_names, best_known, save_actions
 from synthetic_runs import synthetic_run
 from toy_runner import COARSE_32
 
-TASKS = (
-    "Assembly", "Chopsticks", "Move", "Pinch", "RollingPin", "Rope", "Table", "Torus", "TripleMove", "Writer",
-)  # fmt: skip
+TASKS = suite_tasks()
 GEOMETRIC = ("Move", "Rope", "TripleMove")
 MOVE_NAMES = ["0_x", "0_y", "0_z", "1_x", "1_y", "1_z"]
-VARIANTS = ("1", "2", "3", "4", "5")
 COARSE = (*COARSE_32, "progress=false")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +20,9 @@ from plab.objective import target_observation
 from plab.problem import Problem
 from plab.results import read
 from plab.runners import run_config
+from suite import DEVICE
 from toy_runner import COARSE_32
 
-DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
 COARSE = [*COARSE_32, "sim.horizon=3", f"sim.device={DEVICE}"]
 NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
 RANGES = {

@@ -24,6 +24,8 @@ from plab.results import check, load, pack, read
 
 pytestmark = pytest.mark.nightly
 
+HEALTH = list(HealthCheck)
+
 
 def answered(reading: Callable[[], Any]) -> None:
     """Read a file, or be refused in a short line."""
@@ -66,13 +68,7 @@ def test_any_change_of_a_file(tmp_path: Path, packed: bool) -> None:
     content = path.read_bytes()
 
     # The same cases each time.
-    @settings(
-        max_examples=200,
-        deadline=None,
-        derandomize=True,
-        database=None,
-        suppress_health_check=list(HealthCheck),
-    )
+    @settings(max_examples=200, deadline=None, derandomize=True, database=None, suppress_health_check=HEALTH)
     @given(st.booleans(), st.floats(0, 1, exclude_max=True), st.binary(max_size=60))
     def attempt(cut: bool, share: float, put: bytes) -> None:
         at = int(share * len(content))

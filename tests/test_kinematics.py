@@ -78,14 +78,8 @@ UPRIGHT = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
 
 def placed(free: bool = False, position=(0.28, 0.0, 0.5), **options) -> Chain:
     model, _digest = read_model(ARM)
-    given = {
-        "scale": {".*": 0.05, "left|right": 0.01, "base_.*": 0.02},
-        "start": {},
-        "limits": {},
-        "together": {},
-    }
-    if not free:
-        del given["scale"]["base_.*"]
+    scale = {".*": 0.05, "left|right": 0.01} | ({"base_.*": 0.02} if free else {})
+    given = {"scale": scale, "start": {}, "limits": {}, "together": {}}
     return model.placed(position, UPRIGHT, free, **given | options)
 
 
@@ -209,9 +203,8 @@ def test_the_gradient_by_joint_actions(arm: Simulator) -> None:
 @pytest.mark.parametrize("task", EXTENSION_TASKS)
 def test_every_extension_task_has_a_known_solution(task: str) -> None:
     """Check five variants and random ones, all different."""
-    words = [[f"variant={v}"] for v in SUITE_VARIANTS] + [
-        ["variant=random", f"seed_scene={s}"] for s in (0, 1)
-    ]
+    words = [[f"variant={v}"] for v in SUITE_VARIANTS]
+    words += [["variant=random", f"seed_scene={s}"] for s in (0, 1)]
     known = [known_actions(load_config([f"task={task}", *one])) for one in words]
     assert all(actions.shape[0] == 50 and 0 < np.abs(actions).max() <= 1 for actions in known)
     assert len({actions.tobytes() for actions in known}) == len(words)

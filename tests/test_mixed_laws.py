@@ -30,16 +30,10 @@ def layered(laws: tuple[str, ...]) -> Scene:
     """The box of :mod:`suite` in layers with different laws, whose tiles mix particles of several laws."""
     whole = suite.scene(suite.KINDS)
     x, y, z = whole.bodies[0].center
-    height = suite.WIDTH / len(laws)
+    height, bottom = suite.WIDTH / len(laws), y - suite.WIDTH / 2
+    edges = (suite.WIDTH, height, suite.WIDTH)
     bodies = tuple(
-        Body(
-            "box",
-            (x, y - suite.WIDTH / 2 + (k + 0.5) * height, z),
-            (suite.WIDTH, height, suite.WIDTH),
-            29 + k,
-            law=law,
-            **OWN.get(law, {}),
-        )
+        Body("box", (x, bottom + (k + 0.5) * height, z), edges, 29 + k, law=law, **OWN.get(law, {}))
         for k, law in enumerate(laws)
     )
     return dataclasses.replace(whole, bodies=bodies, manipulators=suite.tools(whole, ("Sphere",)))
@@ -57,15 +51,14 @@ def simulator(request: pytest.FixtureRequest) -> Simulator:
     v, c = rng.normal(size=rest.v.shape), rng.normal(scale=20.0, size=rest.C.shape)
     f = 0.98 * np.eye(3) + rng.normal(scale=0.02, size=c.shape)
     built.set_initial_state(State(rest.x, v, c, f, rest.poses))
-    built.sdf = sdf[0]
+    built.sdf, built.actions = sdf[0], np.random.default_rng(7).uniform(-0.9, 0.9, (1, 2, scene.action_dim))
     return built
 
 
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_states_and_gradients_are_those_of_the_reference(simulator: Simulator, contact: str) -> None:
     simulator.set_contact(contact)
-    scene = simulator.scenes[0]
-    actions = np.random.default_rng(7).uniform(-0.9, 0.9, (1, 2, scene.action_dim))
+    scene, actions = simulator.scenes[0], simulator.actions
     simulator.reset()
     given = simulator.state()
     got, end, bar = simulator.rollout(actions), simulator.state(), simulator.state_gradient()
@@ -86,8 +79,7 @@ def test_states_and_gradients_are_those_of_the_reference(simulator: Simulator, c
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_each_parameter_has_the_gradient_of_central_differences(simulator: Simulator, contact: str) -> None:
     simulator.set_contact(contact)
-    scene = simulator.scenes[0]
-    actions = np.random.default_rng(7).uniform(-0.9, 0.9, (1, 2, scene.action_dim))
+    scene, actions = simulator.scenes[0], simulator.actions
     simulator.rollout(actions)
     gradient = simulator.material_gradient().reshape(len(scene.bodies), -1)
     noise = 1e-13

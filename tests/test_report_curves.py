@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -139,12 +140,8 @@ def test_methods_are_compared_on_what_they_share() -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     results = tmp_path_factory.mktemp("results")
-    for name in ("ppo", "adam"):
-        for task in ("Rope", "Move"):
-            for variant in "12":
-                for seed in range(2):
-                    which = {"task": task, "variant": variant, "method": name, "seed": seed}
-                    synthetic.save(synthetic.run(results, **which))
+    for name, task, variant, seed in itertools.product(("ppo", "adam"), ("Rope", "Move"), "12", range(2)):
+        synthetic.save(synthetic.run(results, method=name, task=task, variant=variant, seed=seed))
     return results
 
 

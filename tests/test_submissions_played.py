@@ -154,9 +154,8 @@ def test_claims_are_simulated_again(
     assert verify([str(recorded), *COARSE]) == 1
     out, err = capsys.readouterr()
     false, broke = err.splitlines()
-    assert all(
-        part in false for part in (str(recorded), "v2 after 8", f"{lie.score:.4f}", f"{second.score:.4f}")
-    )
+    told = str(recorded), "v2 after 8", f"{lie.score:.4f}", f"{second.score:.4f}"
+    assert all(part in false for part in told)
     assert "v1 after 9" in broke and "at step 2: not finite" in broke
     assert "3 of 5 claim(s) hold" in out
     kept = read_verification(read(recorded))
@@ -191,12 +190,8 @@ def torchscript(path: Path, module: torch.nn.Module) -> bytes:
 
 def as_onnx(module: Acting) -> bytes:
     """The same policy in ONNX."""
-    weights = {
-        "w": module.layer.weight.detach().numpy(),
-        "b": module.layer.bias.detach().numpy(),
-        "low": np.float32(-1.0),
-        "high": np.float32(1.0),
-    }
+    weights = {"low": np.float32(-1.0), "high": np.float32(1.0)}
+    weights |= {"w": module.layer.weight.detach().numpy(), "b": module.layer.bias.detach().numpy()}
     nodes = [
         helper.make_node("Clip", ["x", "low", "high"], ["c"]),
         helper.make_node("Gemm", ["c", "w", "b"], ["a"], transB=1),

@@ -260,10 +260,8 @@ def test_gradients_by_initial_poses(touched: Simulator) -> None:
         for move in moves:
             direction = np.zeros_like(points[e].state.poses)
             direction[m] = 0.1 * move
-            ways[f"{kind} along {move.round(2)}"] = (
-                pose_way(points[e], direction),
-                (bar[e] * direction).sum(),
-            )
+            slope = (bar[e] * direction).sum()
+            ways[f"{kind} along {move.round(2)}"] = pose_way(points[e], direction), slope
         check_slopes(touched, ways)
 
 
