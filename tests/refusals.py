@@ -1,12 +1,26 @@
-"""Checks of refusals: exit code 2, one line on standard error, nothing on standard output."""
+"""Checks of refusals: an error with one line, or exit code 2, one line on standard error and nothing on
+standard output."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-__all__ = ["ending", "refusal", "snapshot"]
+import pytest
+
+__all__ = ["ending", "refusal", "snapshot", "why"]
+
+
+def why(
+    error: type[Exception] | tuple[type[Exception], ...], call: Callable[..., Any], *args: Any, **options: Any
+) -> str:
+    """Assert that a call raises an error whose message is one line; return the message."""
+    with pytest.raises(error) as caught:
+        call(*args, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:

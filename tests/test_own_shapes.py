@@ -24,6 +24,7 @@ from plab.scenes import Body, Scene, make_body, sample_particles
 from plab.scenes.mesh import load_mesh
 from plab.targets import TargetError, build_target
 from plab.targets.recipes import read_points
+from refusals import why
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -175,9 +176,7 @@ def test_files_of_strangers_are_refused(capfd, monkeypatch):
     contents["it.stl"].append(b" " * 80 + struct.pack("<I", 2**32 - 1) + b"\0" * 50)
     for name, cases in contents.items():
         for content in cases:
-            with pytest.raises(ShapeError, match=re.escape(name)) as error:
-                load_mesh(write(content, name))
-            assert "\n" not in str(error.value)
+            assert name in why(ShapeError, load_mesh, write(content, name))
     assert capfd.readouterr() == ("", "")
     monkeypatch.setattr("plab.files._LARGEST_SHAPE", 100)
     with pytest.raises(ShapeError, match=r"it\.obj .*MB"):

@@ -11,6 +11,7 @@ import pytest
 
 from plab.config import ConfigError
 from plab.plugins import exported_module_path, load_object, search_in
+from refusals import why
 
 
 @pytest.fixture
@@ -62,6 +63,4 @@ def test_what_is_wrong_is_one_line(folder: Path) -> None:
         )
     ):
         (folder / f"zz_{k}.py").write_text(code)
-        with pytest.raises(ConfigError) as caught:
-            load_object(text.format(k), int)
-        assert named.format(k) in str(caught.value) and "\n" not in str(caught.value)
+        assert named.format(k) in why(ConfigError, load_object, text.format(k), int)

@@ -16,7 +16,7 @@ from plab.cli import report, results, status
 from plab.cli.main import main as plab_main
 from plab.cli.rollouts import export, render, view
 from plab.cli.run import main
-from plab.cli.submissions import leaderboard, submit, verify
+from plab.cli.submissions import submit
 from plab.cli.suite import demonstrations, targets
 from plab.config import load_config
 from plab.config.compose import check_sources
@@ -26,6 +26,7 @@ from plab.problem import Problem
 from plab.render import graphics
 from plab.results import load
 from plab.sim import Simulator
+from refusals import why
 from suite import scene
 
 MISSING = graphics.missing_graphics
@@ -65,7 +66,6 @@ COMPOSED = {
     "seed=abc": "seed",
     "method.betas=0.9": "method.betas",
     "results_dir=": "results_dir",
-    "variant=random seed_scene=-1": "seed_scene",
     "task.variants.1=7": "variant 1",
     "task.variants.1.manipulators.pillar.position=[0,0]": "pillar.position",
     "task.target.radius=wide": "task.target.radius",
@@ -93,7 +93,6 @@ RUN = {
     "+experiment=smoke,paper_rl": "+experiment=smoke,paper_rl",
     "seed=0,1": "-m",
     "--mutlirun": "did you mean --multirun?",
-    "--config-dir nowhere": "nowhere",
     "--config-dir=": "config folder",
     # no effect on a single run
     "variant=2 task.variants.1.manipulators.pillar.position=[0.4,0,0.5]": "variant=2",
@@ -118,9 +117,7 @@ RUN = {
 
 @pytest.mark.parametrize("argv", COMPOSED)
 def test_refusals_of_overrides(argv):
-    with pytest.raises(PlabError) as caught:
-        check_sources(load_config(argv.split(" ")))
-    assert COMPOSED[argv] in str(caught.value) and "\n" not in str(caught.value)
+    assert COMPOSED[argv] in why(PlabError, lambda: check_sources(load_config(argv.split(" "))))
 
 
 @pytest.mark.parametrize("argv", RUN)
@@ -154,8 +151,6 @@ TOOLS = [
     (targets, "--task Rope --rebuild targets.source=files", "--rebuild"),
     (demonstrations, "--task Move nowhere", "nowhere"),
     (submit, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
-    (verify, "nowhere", "nowhere"),
-    (leaderboard, "nowhere", "nowhere"),
     (speed.main, "--batch 0", "--batch"),
     (accuracy.main, "--task Table", "Table"),
     (bench.main, "sped", "did you mean speed?"),
@@ -222,9 +217,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
 @pytest.mark.parametrize("case", CALLS)
 def test_calls_from_python(case):
     call, named = CALLS[case]
-    with pytest.raises(PlabError) as caught:
-        call()
-    assert named in str(caught.value) and "\n" not in str(caught.value)
+    assert named in why(PlabError, call)
 
 
 def test_rollouts_of_no_steps_and_of_no_numbers():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import re
@@ -18,6 +19,7 @@ import pytest
 import yaml
 
 import plab
+import refusals
 import synthetic
 from plab.cli.submissions import leaderboard, submit, verify
 from plab.config import load_config
@@ -53,6 +55,7 @@ from synthetic_runs import synthetic_run, template
 
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)
+why = functools.partial(refusals.why, ResultsError)
 GOOD = dataclasses.asdict(CARD) | {"authors": list(CARD.authors)}
 CHECKSUM = "a" * 64
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
@@ -87,14 +90,6 @@ def with_manifest(path: Path, values: dict[str, Any], entry: int | None = None) 
     about = json.loads(read_members(path)["manifest.json"])
     (about if entry is None else about["entries"][entry]).update(values)
     return changed(path, manifest_json=json.dumps(about).encode())
-
-
-def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the message of the error that a call raises."""
-    with pytest.raises(ResultsError) as caught:
-        function(*args, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def test_round_trip_of_plans(path: Path) -> None:
@@ -322,12 +317,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def leaders(folder: Path) -> tuple[list[dict], list[str]]:
-    return board(folder)
+def leaders(folder: Path) -> tuple[dict[str, dict], list[str]]:
+    """Sections of the leaderboard by title, and what is left out."""
+    sections, left_out = board(folder)
+    return {section["title"]: section for section in sections}, left_out
 
 
 def test_scores_are_means_of_whole_tables_within_budgets(leaders) -> None:
-    sections = {section["title"]: section for section in leaders[0]}
+    sections, _ = leaders
     lines = {line["card"].name: line for line in sections["plab's suite"]["lines"]}
     plans = lines["plans"]
     assert plans["status"] == "verified" and plans["covered"] == 2
@@ -374,7 +371,7 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
 
 
 def test_the_papers_numbers_are_a_table(leaders) -> None:
-    sections = {section["title"]: section for section in leaders[0]}
+    sections, _ = leaders
     paper = sections["The paper's table"]
     lines = {(line["card"].name, line["status"]): line for line in paper["lines"]}
     assert len(lines) == len(paper["lines"]) == 6

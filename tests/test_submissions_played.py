@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from gymnasium.wrappers import RescaleAction
 from onnx import TensorProto, helper
 
 import plab  # noqa: F401
+import refusals
 from plab.cli.submissions import submit, verify
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
@@ -28,6 +30,7 @@ from toy_runner import COARSE_32
 ROOT = Path(__file__).resolve().parents[1]
 COARSE = (*COARSE_32, "sim.horizon=6")
 CARD = ROOT / "examples" / "outside_agent" / "card.yaml"
+why = functools.partial(refusals.why, SubmissionError)
 NAME = "RollingPin-v1.plabsub.zip"
 
 # Three plans, which score 0.004, 0.011 and 0.001 in variant 1; shape [plan, T, A].
@@ -56,14 +59,6 @@ def submission(tmp_path: Path, *argv: str) -> Path:
     made = tmp_path / "mine.plabsub.zip"
     assert submit([*argv, "--card", str(CARD), "--output", str(made)]) == 0
     return made
-
-
-def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
-    """Return the message of the SubmissionError that a call raises."""
-    with pytest.raises(SubmissionError) as caught:
-        function(*args, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def test_the_best_episode_of_each_budget_is_kept(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import lzma
 import os
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
+import refusals
 import synthetic
 from plab.cli import status
 from plab.config import build_scene, load_config
@@ -29,6 +31,7 @@ from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, 
 from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target
 
+said = functools.partial(refusals.why, (ResultsError, TargetError))
 RUN = "Rope-v1/adam/seed0.h5"
 
 
@@ -87,14 +90,6 @@ def make_policy(folder: Path) -> Path:
     return policy_path(folder / "run.h5")
 
 
-def said(reading: Callable[[], Any]) -> str:
-    """Return the message of a refusal."""
-    with pytest.raises((ResultsError, TargetError)) as caught:
-        reading()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 # ----------------------------------------------------------------------------------------------- result files
 
 
@@ -111,7 +106,7 @@ def test_links_and_data_elsewhere_are_not_followed(tmp_path: Path) -> None:
                 file["best"].create_dataset("actions", (4,), float, external=[(str(raw), 0, 32)])
             else:
                 file["best/actions"] = link
-        line = said(lambda path=path: read(path))
+        line = said(read, path)
         assert str(path) in line and "actions" in line
 
 
@@ -122,10 +117,10 @@ def test_arrays_that_the_file_does_not_hold(tmp_path: Path) -> None:
         file["best"].create_dataset("actions", (10**12,), float, chunks=(10**6,))
         mass = file["mass"].create_group("final")
         mass.attrs["shape"], mass["index"], mass["value"] = [2**20] * 3, [0], [1.0]
-    assert "actions claims 8000000000000 bytes" in said(lambda: read(path))
+    assert "actions claims 8000000000000 bytes" in said(read, path)
     with h5py.File(path, "r+") as file:
         del file["best/actions"]
-    assert f"mass/final claims {2**60} entries" in said(lambda: read(path))
+    assert f"mass/final claims {2**60} entries" in said(read, path)
 
 
 # ------------------------------------------------------------------------------------------------ archives
@@ -146,7 +141,7 @@ def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
     archive.write_bytes(lzma.compress(make(saved(tmp_path / "results").read_bytes()), preset=0))
     (line,) = (str(row) for row in read_rows(archive))
     assert line.startswith(str(archive)) and named in line
-    assert said(lambda: unpack(archive, out)) == line
+    assert said(unpack, archive, out) == line
     assert not out.exists()
     ((_, problem),) = check(archive)
     assert problem and problem in line
@@ -158,7 +153,7 @@ def test_runs_do_not_choose_where_they_are_unpacked(tmp_path: Path) -> None:
         config = synthetic.config(tmp_path, task=name)
         synthetic.write(dataclasses.replace(synthetic.run(tmp_path), config=config), path)
         archive.write_bytes(lzma.compress(zipped([("run.h5", path.read_bytes())]), preset=0))
-        assert f"'{name}'" in said(lambda: unpack(archive, tmp_path / "out"))
+        assert f"'{name}'" in said(unpack, archive, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
 
@@ -169,7 +164,7 @@ def test_targets_are_arrays_alone(tmp_path: Path) -> None:
     path, marker = make_target(tmp_path / "files"), tmp_path / "marker"
 
     def refused() -> None:
-        assert str(path) in said(lambda: load_release_target(path.parent, target_scene(), "1"))
+        assert str(path) in said(load_release_target, path.parent, target_scene(), "1")
 
     np.save(path, np.array([Marker(marker)], dtype=object), allow_pickle=True)
     refused()
@@ -194,7 +189,7 @@ def test_policies_are_arrays_alone(tmp_path: Path) -> None:
         (sound | {"header": np.array(header.replace('"ppo"', '"${oc.env:HOME}"', 1))}, "method"),
     ):
         np.savez(path, **arrays)
-        line = said(lambda: load_policy(path.with_name("run.h5")))
+        line = said(load_policy, path.with_name("run.h5"))
         assert str(path) in line and named in line
     assert not marker.exists()
 
@@ -207,7 +202,7 @@ def test_no_file_chooses_what_is_imported(tmp_path: Path, monkeypatch) -> None:
         arrays = dict(file)
     text = str(arrays["header"]).replace('"family": "rl"', '"family": "zz_evil:FAMILY"')
     np.savez(path, **arrays | {"header": np.array(text)})
-    assert "zz_evil" in said(lambda: load_policy(path.with_name("run.h5")))
+    assert "zz_evil" in said(load_policy, path.with_name("run.h5"))
     run = synthetic.run(tmp_path / "results")
     run.config["method"]["family"] = "zz_evil:FAMILY"
     path = synthetic.save(run)
