@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from browsing import browser  # noqa: F401
+from pages import star_files  # noqa: F401
 from plab.config import Config
 from plab.runners.runner import Outcome, SimulatorCache
 from plab.sim.runtime import cuda_devices
@@ -81,6 +82,11 @@ def _own_logging() -> Iterator[None]:
     for logger in logging.root.manager.loggerDict.values():
         if isinstance(logger, logging.Logger):
             logger.disabled = False
+
+
+@pytest.fixture
+def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture

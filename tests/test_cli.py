@@ -19,10 +19,7 @@ from plab.runners import RunError
 from plab.sim.runtime import cuda_devices
 from toy_runner import COARSE
 
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("in_an_empty_folder")
 
 
 @pytest.mark.skipif(cuda_devices(), reason="there is a CUDA device")

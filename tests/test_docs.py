@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from pages import ROOT
 from plab.cli.main import COMMANDS
 from plab.cli.main import main as command_line
 from plab.cli.run import parser
@@ -21,7 +22,6 @@ from plab.config import choices, load_config
 from plab.config.overrides import parse, prepared, swept
 from plab.config.selection import select
 
-ROOT = Path(__file__).resolve().parents[1]
 FILES = ("README.md", "CONTRIBUTING.md", "docs/*.md", "src/**/README.md")
 PAGES = sorted(path for pattern in FILES for path in ROOT.glob(pattern))
 NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
@@ -63,17 +63,6 @@ def compose(words: tuple[str, ...], config_dir: str | None = None) -> None:
 
 class Parsed(Exception):
     """Exception that ends a command line once its options have been parsed."""
-
-
-@pytest.fixture(scope="module")
-def star_files(tmp_path_factory):
-    """Folder with the files that the script of docs/own_shapes.md writes."""
-    folder = tmp_path_factory.mktemp("star")
-    code = (ROOT / "examples" / "own_shapes" / "star.py").read_text(encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        exec(code, {})
-    return folder
 
 
 @pytest.mark.parametrize("command", PLAB)

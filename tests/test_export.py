@@ -16,10 +16,7 @@ from toy_runner import COARSE
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.writers")
 
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("in_an_empty_folder")
 
 
 @pytest.fixture(scope="module")

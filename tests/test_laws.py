@@ -3,7 +3,6 @@
 import ctypes
 import dataclasses
 import math
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 import laws
+from pages import ROOT, blocks
 from plab.config import ConfigError, build_scene, load_config
 from plab.laws import Law
 from plab.laws.algebra import Series
@@ -23,7 +23,7 @@ from plab.sim.cuda_sums import add
 from plab.sim.runtime import start_runtime
 from suite import instructions_of_the_host
 
-sys.path.append(str(Path(__file__).parents[1] / "examples" / "own_law"))
+sys.path.append(str(ROOT / "examples" / "own_law"))
 SNOW = find_law("snow:SNOW")
 """The law of docs/own_law.md."""
 
@@ -383,14 +383,12 @@ def test_laws_are_found_by_name() -> None:
 
 
 def test_the_page_on_laws_shows_its_example_and_what_it_prints(capsys) -> None:
-    root = Path(__file__).parents[1]
-    page = (root / "docs" / "own_law.md").read_text(encoding="utf-8")
-    law, trial = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert law == (root / "examples/own_law/snow.py").read_text(encoding="utf-8")
-    task = (root / "examples/own_law/conf/task/Snow.yaml").read_text(encoding="utf-8")
-    assert all(excerpt in task for excerpt in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL))
+    law, trial = blocks("own_law.md", "python")
+    assert law == (ROOT / "examples/own_law/snow.py").read_text(encoding="utf-8")
+    task = (ROOT / "examples/own_law/conf/task/Snow.yaml").read_text(encoding="utf-8")
+    assert all(excerpt in task for excerpt in blocks("own_law.md", "yaml"))
     exec(law + trial, {})
-    assert capsys.readouterr().out == re.findall(r"```text\n(.*?)```", page, re.DOTALL)[0]
-    cfg = load_config(["task=Snow", "variant=2"], root / "examples/own_law/conf")
+    assert capsys.readouterr().out == blocks("own_law.md", "text")[0]
+    cfg = load_config(["task=Snow", "variant=2"], ROOT / "examples/own_law/conf")
     (material,) = build_scene(cfg).materials
     assert material.kind is SNOW and material.values["compression"] == 0.01

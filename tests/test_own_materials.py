@@ -5,23 +5,17 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import re
 import shlex
-from pathlib import Path
 
 import pytest
 
+from pages import ROOT, blocks
 from plab.config import Config, build_scene, load_config
 from plab.run import main
 
-ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "examples" / "own_materials" / "conf"
-PAGE = (ROOT / "docs" / "own_materials.md").read_text(encoding="utf-8")
+PAGE = "own_materials.md"
 RUBBER = {"youngs_modulus": 2000.0, "poisson_ratio": 0.3, "yield_stress": math.inf}
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
 
 
 def arguments(line: str) -> list[str]:
@@ -37,9 +31,9 @@ def example(*overrides: str) -> Config:
 
 def test_the_page_shows_the_example_and_its_commands_are_runs_of_it(seen, tmp_path, monkeypatch):
     cushion = (CONF / "task" / "Cushion.yaml").read_text(encoding="utf-8")
-    assert blocks("yaml")[0] in cushion
+    assert blocks(PAGE, "yaml")[0] in cushion
     monkeypatch.chdir(tmp_path)
-    for line in blocks("bash")[0].splitlines():
+    for line in blocks(PAGE, "bash")[0].splitlines():
         assert main(arguments(line)) == 0
     assert [build_scene(cfg).materials[1].youngs_modulus for cfg in seen] == [2000.0, 500.0, 3000.0]
 
@@ -49,8 +43,8 @@ def test_the_cushions_do_as_the_page_prints(monkeypatch):
     monkeypatch.chdir(ROOT)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         names: dict = {}
-        exec("\n".join(blocks("python")), names)
-    assert printed.getvalue().startswith(blocks("text")[0])
+        exec("\n".join(blocks(PAGE, "python")), names)
+    assert printed.getvalue().startswith(blocks(PAGE, "text")[0])
     assert names["by_young"][1] > 0.0 and names["by_yield"][0] != 0.0
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import re
-import runpy
 import shutil
 import struct
 import sys
@@ -13,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pages import ROOT, blocks
 from plab.cli.run import main
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.files import ShapeError
@@ -28,11 +26,9 @@ from refusals import why
 
 trimesh = pytest.importorskip("trimesh")
 
-ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "own_shapes"
 CONF = EXAMPLE / "conf"
 STAR = (CONF / "task" / "Star.yaml").read_text(encoding="utf-8")
-PAGE = (ROOT / "docs" / "own_shapes.md").read_text(encoding="utf-8")
 QUICK = ("sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2", "sim.particles_scale=0.1")
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
@@ -73,29 +69,16 @@ def write(content: str | bytes, name: str = "it.obj") -> str:
     return str(path)
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
-    """Folder with the files that the example's script writes."""
-    folder = tmp_path_factory.mktemp("files")
-    with contextlib.chdir(folder):
-        runpy.run_path(str(EXAMPLE / "star.py"))
-    return folder
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
-
-
-def test_runs_of_each_kind_of_target_are_read_without_the_files(files, tmp_path, monkeypatch):
-    assert all(excerpt in STAR for excerpt in blocks("yaml"))
-    assert (files / "star.obj").read_bytes() == (EXAMPLE / "star.obj").read_bytes()
-    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+def test_runs_of_each_kind_of_target_are_read_without_the_files(star_files, tmp_path, monkeypatch):
+    assert all(excerpt in STAR for excerpt in blocks("own_shapes.md", "yaml"))
+    assert (star_files / "star.obj").read_bytes() == (EXAMPLE / "star.obj").read_bytes()
+    shutil.copytree(star_files, tmp_path, dirs_exist_ok=True)
     shutil.copytree(CONF, tmp_path / "own" / "conf")
     np.save("mass.npy", spread_mass(np.load("cloud.npy"), 16, 1.0))
     method = ["method=cem", "method.population=4", "method.elites=2", "method.iterations=2"]
     run = ["--config-dir", "own/conf", "task=Star", *QUICK, *method, "progress=false"]
     assert main(["-m", *run, "variant=1,2,3"]) == 0
-    (reached,) = blocks("python")
+    (reached,) = blocks("own_shapes.md", "python")
     exec(reached, {})
     assert np.load("mass.npy").shape == (16, 16, 16)
     Path("star.obj").rename("gone.obj")
@@ -197,9 +180,9 @@ def test_particles_of_a_mesh(start):
     assert box.volume == pytest.approx(0.1 * 0.2 * 0.4)
 
 
-def test_targets_of_the_example(files, monkeypatch):
+def test_targets_of_the_example(star_files, monkeypatch):
     """A positioned mesh, and points and masses of the same solid, with all of the scene's mass."""
-    monkeypatch.chdir(files)
+    monkeypatch.chdir(star_files)
     cfgs = [example(), *(example(f"variant={k}", "sim=coarse") for k in (2, 3))]
     scenes = [build_scene(cfg) for cfg in cfgs]
     masses = [build_target(scene, cfg.task.target) for scene, cfg in zip(scenes, cfgs, strict=True)]

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from pages import ROOT, blocks
 from plab.cli.run import main
 from plab.config import ConfigError, build_scene, load_config
 from plab.targets import build_target
 
-ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "examples" / "own_task" / "conf"
 DUMBBELL = (OWN / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
-PAGE = (ROOT / "docs" / "own_task.md").read_text(encoding="utf-8")
 
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("in_an_empty_folder")
 
 
 @pytest.fixture
@@ -45,10 +36,10 @@ def own(tmp_path) -> Callable[..., Path]:
 
 
 def test_page_has_the_examples_lines_and_code(monkeypatch):
-    assert all(excerpt in DUMBBELL for excerpt in blocks("yaml"))
+    assert all(excerpt in DUMBBELL for excerpt in blocks("own_task.md", "yaml"))
     monkeypatch.chdir(ROOT)
     names: dict = {}
-    for code in blocks("python"):
+    for code in blocks("own_task.md", "python"):
         exec(code, names)
     assert (names["scene"].grid_size, names["scene"].name) == (32, "Dumbbell")
     assert names["simulator"].state().x[0, :, 0].mean() == pytest.approx(0.607, abs=1e-3)

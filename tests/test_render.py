@@ -37,17 +37,13 @@ GHOST = np.array([0.75, 0.1, 0.5])
 SPHERE = Manipulator("Sphere", (0.06,), (0.4, 0.35, 0.5), scale=(0.01,) * 3)
 
 missing = graphics.missing_graphics()
-pytestmark = pytest.mark.skipif(missing is not None, reason=str(missing))
+drawing = pytest.mark.skipif(missing is not None, reason=str(missing))
+pytestmark = [drawing, pytest.mark.usefixtures("in_an_empty_folder")]
 if missing is None:
     from PIL import Image
 
     from plab.render import Renderer
     from plab.render.pictures import save
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 def scene(*manipulators: Manipulator, bodies: tuple[Body, ...] = (CUBE,)) -> Scene:

@@ -16,6 +16,7 @@ import pytest
 
 import plab
 import synthetic
+from pages import ROOT, blocks
 from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.objective import target_sdf
@@ -27,8 +28,6 @@ from plab.targets import build_target
 from same_runs import shared_simulator, stopped_at
 from toy_runner import COARSE, COARSE_32
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
@@ -47,10 +46,6 @@ errors = check_gradient(make_terms({"contact": 1.0}, {"contact": "soft"})[0], [s
 assert max(errors.values()) < 1e-6, errors
 assert abs(manipulator_parts(tool)[0].mesh.points).max(axis=0).round(6).tolist() == [0.09, 0.03, 0.09]
 """
-
-
-def blocks(page: str, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
 def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
@@ -167,7 +162,7 @@ def test_results(monkeypatch, tmp_path):
 def test_rendering():
     pytest.importorskip("k3d")
     pytest.importorskip("pyvista")
-    (words,) = re.findall(r"\[.task=Torus.*?\]", (DOCS / "rendering.md").read_text(encoding="utf-8"))
+    (words,) = re.findall(r"\[.task=Torus.*?\]", (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8"))
     names = run_page("rendering.md", *((old, '["task=Move"]') for old in (words, '["task=Pinch"]')))
     assert names["picture"].shape == (360, 480, 3)
 

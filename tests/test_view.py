@@ -34,13 +34,10 @@ shapes = pytest.importorskip("plab.render.shapes")
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
 
+pytestmark = pytest.mark.usefixtures("in_an_empty_folder")
+
 ACTIONS = np.full((3, 6), 0.5)
 WAY = 0.02 * np.arange(4)[:, None, None] * np.eye(8)[1]
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="module")
