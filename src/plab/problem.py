@@ -31,7 +31,7 @@ from plab.objective import (
     total_loss,
 )
 from plab.scenes import SceneError
-from plab.sim import Simulator
+from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, check_target, load_release_target
 
@@ -316,6 +316,32 @@ class Problem:
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
         return BatchMeasures(measures, loss[:, -1], result.gradient, result.failures)
+
+    def iou_gradient(self, actions: torch.Tensor, diverged: list[int]) -> torch.Tensor:
+        """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
+        actions of that shape; 0 for ``diverged`` episodes and for those whose gradient diverges."""
+        from plab.plugins import torch
+
+        left, given = set(diverged), actions.clone()
+        while True:
+            given[list(left)] = 0.0
+            try:
+                recorded = self.simulator.record(given if given.is_cuda else given.numpy(), every_step=False)
+                mass = torch.as_tensor(recorded.mass).double().requires_grad_()
+                target = torch.as_tensor(self.target_mass).to(mass)[:, None]
+                a, b = (m / m.amax((2, 3, 4), keepdim=True) for m in (mass, target))
+                both = (a * b).sum((2, 3, 4))
+                iou = both / ((a + b).sum((2, 3, 4)) - both)
+                (slope,) = torch.autograd.grad(iou.sum(), mass)
+                out = torch.as_tensor(recorded.pullback(mass=slope if given.is_cuda else slope.numpy()))
+            except SimulationError as error:
+                # An episode without actions may diverge, too.
+                if left.issuperset(error.failures):
+                    raise
+                left |= set(error.failures)
+                continue
+            out[list(left)] = 0.0
+            return out
 
     def rollout(
         self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True

@@ -83,7 +83,7 @@ class GradientPlanner(Planner):
         """Update the actions by their gradient."""
         tried = self.candidates()
         softness = self.method.softness if self.method.contact == "soft" else None
-        answer = yield Request(tried, softness, gradient=True)
+        answer = yield Request(tried, softness, gradient="loss")
         if answer.gradient is not None:
             self._rule.step(answer.gradient[0].cpu().numpy())
         if softness is not None:

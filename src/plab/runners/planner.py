@@ -41,7 +41,8 @@ class PlannerConfig(MethodConfig):
         iterations: Rows of the result; the cost of a row depends on the planner.
         population: Number of candidates, each an action sequence.
         objective: Criterion for ranking candidates: ``loss`` of the whole episode; ``final``, the loss of the
-            last step; or ``score``, with the loss if the score is 0.
+            last step; or ``score``, with the loss if the score is 0. ``multistart`` descends the loss of the
+            episode, with ``score`` the negative soft IoU of its last state.
         action_init: Half width of the uniform distribution of random candidates.
         contact_starts: Fraction of the initial candidates that move manipulators to the body and push or
             carry it towards the target; the others are random.
@@ -62,12 +63,12 @@ class Request:
     Attributes:
         actions: Actions in [-1, 1], shape [P, T, A].
         softness: Decay rate of the soft contact model [1 / domain unit]; None: hard contact.
-        gradient: Whether gradients are requested.
+        gradient: Function whose gradient is requested: ``loss``, ``score`` (the negative soft IoU) or none.
     """
 
     actions: Tensor
     softness: float | None = None
-    gradient: bool = False
+    gradient: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Answer:
     Attributes:
         measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
         final_loss: Loss of the last step, shape [P].
-        gradient: Gradient of ``loss``, shape [P, T, A], 0 for diverged candidates; None if not requested.
+        gradient: Requested gradient, shape [P, T, A], 0 for diverged candidates; None if not requested.
         broken: Diverged candidates, shape [P], bool; their values are meaningless.
     """
 
@@ -313,7 +314,7 @@ class PlannerRunner(Runner):
             together = {t: r for t, r in pending.items() if (r.gradient, r.actions.shape) == kind}
             for track, answer in self._try(together).items():
                 request = pending.pop(track)
-                spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
+                spent[track][request.gradient != ""] += request.actions.shape[0] * request.actions.shape[1]
                 try:
                     if track.open:
                         pending[track] = walks[track].send(answer)
@@ -345,12 +346,16 @@ class PlannerRunner(Runner):
         self.problem.simulator.set_contact(list(models) * width, np.tile(softness, width).tolist())
         parts: dict[str, list[Tensor]] = defaultdict(list)
         for part in tried.split(width):
-            trials = self.problem.evaluate_actions(part.flatten(0, 1), gradient=first.gradient)
+            flat = part.flatten(0, 1)
+            trials = self.problem.evaluate_actions(flat, gradient=first.gradient == "loss")
+            gradient = trials.gradient
+            if first.gradient == "score":
+                gradient = -self.problem.iou_gradient(flat, list(trials.failures))
             broken = torch.zeros(part.shape[:2].numel(), dtype=torch.bool, device=self._device)
             broken[list(trials.failures)] = True
             reasons |= {e % len(self.tracks): text for e, text in trials.failures.items()}
             given = trials.measures | {"final": trials.final_loss, "broken": broken}
-            for name, values in (given | ({"gradient": trials.gradient} if first.gradient else {})).items():
+            for name, values in (given | ({"gradient": gradient} if first.gradient else {})).items():
                 parts[name].append(torch.as_tensor(values).reshape(*part.shape[:2], *values.shape[1:]))
         whole = {name: torch.cat(rows)[:count] for name, rows in parts.items()}
         answers = {}

@@ -85,11 +85,12 @@ class Multistart(Planner):
             # Changes geometrically over the iterations.
             end, last = method.softness_end or method.softness, max(method.iterations - 1, 1)
             softness = method.softness * (end / method.softness) ** (self.iteration / last)
-        answer = shown = yield Request(actions, gradient=softness is None)
+        wanted = "score" if method.objective == "score" else "loss"
+        answer = shown = yield Request(actions, gradient=wanted if softness is None else "")
         order = shown.cost(method.objective).argsort(stable=True)
         for update in range(method.updates):
             if update > 0 or softness is not None:
-                answer = yield Request(self.memory["actions"], softness, gradient=True)
+                answer = yield Request(self.memory["actions"], softness, gradient=wanted)
             assert answer.gradient is not None
             self._descend(answer.gradient)
         self.memory["order"] = order
