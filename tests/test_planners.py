@@ -23,6 +23,7 @@ from plab.runners.contact_starts import ContactStarts
 from plab.runners.planner import Answer, CandidateStart, Request, make_planner
 from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
+from plab.sim import SimulationError
 from plab.sweep.execution import plan
 from same_runs import CACHE, assert_same_numbers, run, stopped_at
 from toy_runner import COARSE_32
@@ -315,6 +316,24 @@ def test_the_gradient_of_the_iou(tmp_path: Path) -> None:
     assert float((gradient[0] * actions[3]).sum()) == pytest.approx(
         (measured[1] - measured[2]) / 0.02, rel=1e-2
     )
+
+
+def test_the_gradient_of_the_iou_leaves_out_episodes_that_diverge(tmp_path: Path, monkeypatch) -> None:
+    problem = runner.shared_problem(CACHE, [make_config(tmp_path, "multistart")] * 4)
+    actions = torch.rand(4, STEPS, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    want, record = problem.iou_gradient(actions, [2]), problem.simulator.record
+
+    def diverging(given: np.ndarray, **options: bool) -> object:
+        if given[2].any():
+            raise SimulationError("environment 2 diverged", {2: "gone"})
+        return record(given, **options)
+
+    monkeypatch.setattr(problem.simulator, "record", diverging)
+    got = problem.iou_gradient(actions, [])
+    assert torch.equal(got, want) and not got[2].any() and all(got[e].any() for e in (0, 1, 3))
+    monkeypatch.setattr(problem.simulator, "record", lambda *_, **__: diverging(np.ones((3, 1))))
+    with pytest.raises(SimulationError, match="diverged"):
+        problem.iou_gradient(actions, [])
 
 
 def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypatch) -> None:

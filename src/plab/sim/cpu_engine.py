@@ -32,7 +32,7 @@ PROBE_FIRST, PROBE = 8, 100
 and largest interval."""
 
 TIMED_LAUNCHES = 3
-"""Number of launches timed per team; the fastest counts, because launches can be interrupted."""
+"""Number of last launches timed per team; their median counts, because launches can be interrupted."""
 
 SLOW_TEAM_RATIO = 1.5
 """A team slower than the first one by this factor is initially timed only once."""
