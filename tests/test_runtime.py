@@ -110,27 +110,3 @@ def test_compiled_kernels_are_launched_directly(monkeypatch) -> None:
         multiplier.multiply(np.ones(4)[::2], 3)
     monkeypatch.undo()
     assert (taichi.to_numpy() == 6).all()
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="of Linux")
-def test_workers_are_bound_to_a_core_each_and_released() -> None:
-    cpus = os.sched_getaffinity(0)
-    runtime = start_runtime("cpu", "float32", len(cpus))
-    assert len(set(runtime.workers)) == len(cpus)
-    before = {worker: _nanoseconds(worker) for worker in runtime.workers}
-    multiplier, values = Multiplier(), ti.ndarray(ti.f32, 1 << 22)
-    for _ in range(20):
-        multiplier.multiply(values, 2)
-    assert all(_nanoseconds(worker) > before[worker] for worker in runtime.workers)
-    for bound in (True, True, False):
-        runtime.bind_workers(bound)
-        held = [os.sched_getaffinity(worker) for worker in runtime.workers]
-        assert set().union(*held) == cpus and {len(own) for own in held} == {1 if bound else len(cpus)}
-    assert start_runtime("cpu", "float64", len(cpus) + 1).workers != runtime.workers
-    assert len(cpus) == 1 or not start_runtime("cpu", "float32", 1).workers
-
-
-def _nanoseconds(thread: int) -> int:
-    """CPU time of a thread."""
-    with open(f"/proc/self/task/{thread}/schedstat") as file:
-        return int(file.read().split()[0])

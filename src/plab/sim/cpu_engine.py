@@ -8,13 +8,12 @@ thread has separate environments.
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from plab.sim.compiler import address_of, ti
 from plab.sim.cpu_tiles import KEY, NODE, TilePhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import PosePhases
-from plab.sim.runtime import Runtime
 from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STATE, STENCILS, STRAINS
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
@@ -27,12 +26,12 @@ MIN_TASK_SIZE = 512
 PADDING = 32
 """Stride between the barrier counters of teams, to avoid sharing cache lines."""
 
-PROBE_FIRST, PROBE = 8, 100
-"""Launches after which the slower team is timed again: interval after a change of teams, doubled each time,
-and largest interval."""
+PROBE_FIRST, PROBE = 16, 100
+"""Launches after which the slower team is timed again: first interval, doubled each time, and largest
+interval."""
 
 TIMED_LAUNCHES = 3
-"""Number of last launches timed per team; their median counts, because launches can be interrupted."""
+"""Number of launches timed per team; the fastest counts, because launches can be interrupted."""
 
 SLOW_TEAM_RATIO = 1.5
 """A team slower than the first one by this factor is initially timed only once."""
@@ -324,54 +323,37 @@ class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
 class TeamChoice:
     """Selection of the fastest thread team for the launches of a kernel.
 
-    Barriers are slow if other programs keep the cores busy, because waiting threads spin, and if the system
-    runs two of the threads on one core. Results do not depend on the choice.
+    Barriers are slow if other programs keep the cores busy, because waiting threads spin. Results do not
+    depend on the choice.
     """
 
-    def __init__(self, runtime: Runtime, size: int) -> None:
-        """Start with a team of ``size`` threads, if possible each bound to a core; try the others in
-        order."""
-        self._runtime = runtime
-        teams = [(size, True)] * bool(runtime.workers) + [(size, False), (1, False)]
-        self._seconds: dict[tuple[int, bool], deque[float]] = {
-            team: deque(maxlen=TIMED_LAUNCHES) for team in teams
-        }
-        self._timed_at = dict.fromkeys(teams, 0)
-        self._fastest = teams[0]
-        self._launches, self._interval, self._probe_at = 0, PROBE_FIRST, PROBE_FIRST
+    def __init__(self, sizes: Sequence[int]) -> None:
+        """Start with the first of several teams, given by numbers of threads; try the others in order."""
+        self._seconds: dict[int, deque[float]] = {size: deque(maxlen=TIMED_LAUNCHES) for size in sizes}
+        self._launches, self._probe_at = 0, PROBE_FIRST
 
     def run(self, kernel: Callable, args: tuple) -> None:
         """Launch a kernel with the team size prepended to its arguments."""
         self._launches += 1
-        team = size, bound = self._next()
-        self._runtime.bind_workers(bound)
+        size = self._next()
         start = time.perf_counter()
         kernel(size, *args)
         # The first launch compiles.
         if self._launches > 1:
-            self._seconds[team].append(time.perf_counter() - start)
-            self._timed_at[team] = self._launches
+            self._seconds[size].append(time.perf_counter() - start)
 
-    def _next(self) -> tuple[int, bool]:
-        typical = {
-            team: sorted(taken)[len(taken) // 2] if taken else 0.0 for team, taken in self._seconds.items()
-        }
-        tried = {team: len(taken) for team, taken in self._seconds.items()}
-        limit = SLOW_TEAM_RATIO * next(iter(typical.values()))
+    def _next(self) -> int:
+        fastest = {size: min(seconds, default=0.0) for size, seconds in self._seconds.items()}
+        tried = {size: len(seconds) for size, seconds in self._seconds.items()}
+        limit = SLOW_TEAM_RATIO * next(iter(fastest.values()))
         # Initially time each team equally often, because the first launches of a process are often
         # interrupted.
-        if wanted := [team for team in typical if tried[team] < TIMED_LAUNCHES and typical[team] <= limit]:
+        if wanted := [size for size in fastest if tried[size] < TIMED_LAUNCHES and fastest[size] <= limit]:
             return min(wanted, key=tried.__getitem__)
-        fastest = min(typical, key=typical.__getitem__)
-        if fastest != self._fastest:
-            self._fastest, self._interval = fastest, PROBE_FIRST
-        elif self._launches >= self._probe_at:
-            self._interval = min(2 * self._interval, PROBE)
-            fastest = min(self._timed_at, key=self._timed_at.__getitem__)
-        else:
-            return fastest
-        self._probe_at = self._launches + self._interval
-        return fastest
+        if self._launches >= self._probe_at:
+            self._probe_at += min(self._launches, PROBE)
+            return max(fastest, key=fastest.__getitem__)
+        return min(fastest, key=fastest.__getitem__)
 
 
 @ti.data_oriented
@@ -388,9 +370,7 @@ class CpuEngine(CpuPhases):
     def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
         super().__init__(*args)
-        self._teams = {
-            name: TeamChoice(self.runtime, self.team_size) for name in ("step", "losses", "step_adjoint")
-        }
+        self._teams = {name: TeamChoice((self.team_size, 1)) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, state: ti.Ndarray, *args: object) -> None:
         """Run one environment step; arguments as for :meth:`step_kernel`, without size and address."""

@@ -60,34 +60,21 @@ class Runtime:
         device: ``cpu`` or ``cuda``.
         precision: ``float32`` or ``float64``, the type of particles and grid.
         threads: CPU threads; 1 on CUDA.
-        workers: The system's numbers of these threads, if there are as many as CPUs; otherwise empty.
     """
 
     device: str
     precision: str
     threads: int
-    workers: tuple[int, ...] = ()
 
     @property
     def real(self):
         """Taichi's type of particle and grid data."""
         return ti.f32 if self.precision == "float32" else ti.f64
 
-    def bind_workers(self, bound: bool) -> None:
-        """Bind each worker to one CPU, or release them."""
-        global _bound
-        if bound != _bound:
-            cpus = sorted(os.sched_getaffinity(0))
-            for worker, cpu in zip(self.workers, cpus, strict=False):
-                with contextlib.suppress(OSError):
-                    os.sched_setaffinity(worker, {cpu} if bound else cpus)
-            _bound = bound
-
 
 _current: Runtime | None = None
 _users: weakref.WeakSet = weakref.WeakSet()
 _dropped: list[tuple[Runtime, Any]] = []
-_bound = False
 _process: int | None = None
 _thread: int | None = None
 
@@ -121,7 +108,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         ValueError: If a name is unknown.
         RuntimeError: If Taichi was started in a parent process or in another thread.
     """
-    global _bound, _current, _thread
+    global _current, _thread
     _refuse_fork()
     # Taichi can create fields only in the thread that initialised it, and aborts in others.
     if _thread not in (None, threading.get_ident()):
@@ -151,7 +138,6 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         )
     _users.clear()
     remove_stale_cache_lock()
-    before = _thread_numbers()
     # Taichi prints the device to standard output, which is reserved for the caller.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -173,18 +159,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     clear_kernel_arguments()
     guard_array_release()
     defer_position_lookup()
-    # Taichi creates its workers last.
-    workers = sorted(_thread_numbers() - before)[-wanted:]
-    _bound, known = False, device == "cpu" and len(workers) == _cpus()
-    _current = Runtime(device, precision, wanted, tuple(workers) if known else ())
+    _current = Runtime(device, precision, wanted)
     return _current
-
-
-def _thread_numbers() -> set[int]:
-    """Return the system's numbers of this process's threads on Linux."""
-    with contextlib.suppress(OSError):
-        return set(map(int, os.listdir("/proc/self/task")))
-    return set()
 
 
 def _refuse_fork() -> None:

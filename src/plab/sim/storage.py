@@ -128,7 +128,7 @@ class Storage:
         self.chunks = 1 if self.cuda else CHUNKS
         self.substeps = first.substeps
         # Additional threads per environment work on its chunks as a team.
-        self.runtime, self.threads = runtime, runtime.threads
+        self.threads = runtime.threads
         self.team_size = min(self.chunks, max(1, runtime.threads // self.batch))
         # Number of materials of an environment: 1, or one per body.
         self.materials = first.material_count
