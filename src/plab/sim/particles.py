@@ -15,7 +15,7 @@ import numpy as np
 from plab.sim.compiler import ti
 from plab.sim.state import State
 from plab.sim.storage import AT_C, AT_F, AT_V, STATE
-from plab.sim.tensors import copy_numbers
+from plab.sim.tensors import copy_numbers, from_host
 
 STAMP_MAX = 2**31 - 2**20
 
@@ -127,25 +127,25 @@ class Particles:
         self._start = rows.astype(np.int32).reshape(-1)
         # Copies within the device need not wait for it.
         self._start_there = self.order_array(1)
-        self._start_there.from_numpy(self._start)
+        from_host(self._start_there, self._start)
         self._changed = True
         self.reset_order()
 
     def reset_order(self, environments: Sequence[int] | None = None) -> None:
         """Restore the initial order of all or some environments."""
         if self._changed and environments is None:
-            copy_numbers(self.numbers, 0, self._start_there, self.places, 1)
+            copy_numbers(self.numbers, 0, self._start_there, self.places, True)
             self._changed = False
         if self._changed:
             own = self.places // self.engine.batch
             for e in environments or ():
                 first = int(e) * own
-                copy_numbers(self.numbers, first, self._start[first : first + own], own, 1)
+                copy_numbers(self.numbers, first, self._start[first : first + own], own, True)
 
     def order(self) -> np.ndarray:
         """Return the current order, shape [batch, particle]."""
         out = np.zeros(self.places, np.int32)
-        copy_numbers(self.numbers, 0, out, self.places, 0)
+        copy_numbers(self.numbers, 0, out, self.places, False)
         return out.reshape(self.engine.batch, -1)[:, : self.engine.particles].astype(np.int64)
 
     def noted_order(self) -> ti.Ndarray:
@@ -153,7 +153,7 @@ class Particles:
         if not self.engine.sorts:
             return self.numbers
         copy = self.order_array(1)
-        copy_numbers(copy, 0, self.numbers, self.places, 1)
+        copy_numbers(copy, 0, self.numbers, self.places, True)
         return copy
 
     # -- steps --------------------------------------------------------------------------------------

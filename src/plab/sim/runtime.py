@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import gc
 import io
 import os
@@ -14,6 +15,8 @@ import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from plab.errors import ArgumentError, PlabError
 from plab.scenes import DEVICES, PRECISIONS
@@ -185,6 +188,23 @@ def remove_stale_cache_lock() -> None:
             lock.unlink()
 
 
+def copy_memory(address: int, numbers: np.ndarray, writes: bool) -> None:
+    """Copy a contiguous array to an address on the runtime's device, or from it, after all kernels."""
+    host, size = numbers.ctypes.data, numbers.nbytes
+    if _current is None or _current.device == "cpu":
+        ctypes.memmove(*((address, host) if writes else (host, address)), size)
+        return
+    driver = cuda_driver()
+    assert driver is not None
+    there, here, count = ctypes.c_uint64(address), ctypes.c_void_p(host), ctypes.c_size_t(size)
+    error = (
+        driver.cuMemcpyHtoD_v2(there, here, count) if writes else driver.cuMemcpyDtoH_v2(here, there, count)
+    )
+    if error:
+        raise RuntimeError(f"CUDA could not copy {size} bytes: error {error}")
+
+
+@functools.cache
 def cuda_driver() -> ctypes.CDLL | None:
     """Return the initialised CUDA driver, or None."""
     try:

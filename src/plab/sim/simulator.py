@@ -37,7 +37,15 @@ from plab.sim.state import (
 )
 from plab.sim.storage import WORLD
 from plab.sim.tape import RecordedStates, Tape, closed_loop, record
-from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
+from plab.sim.tensors import (
+    copy_numbers,
+    from_host,
+    kernel_actions,
+    numbers_of,
+    on_device,
+    output_for,
+    to_host,
+)
 from plab.sim.term_phases import LossTerm
 
 if TYPE_CHECKING:
@@ -133,6 +141,7 @@ class Simulator:
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._scratch_terms = ti.ndarray(ti.f64, shape=self._engine.measures * self.batch)
         self._observed: dict[int, ti.Ndarray] = {}
+        self._actions = ti.ndarray(ti.f64, shape=max(1, self.batch * self._engine.actions_per_step))
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         size = self.batch * self.manipulator_count * 3
         self._impulses = ti.ndarray(ti.f64, shape=max(1, size)) if impulses else None
@@ -323,7 +332,7 @@ class Simulator:
             chosen[list(environments)] = 1
             if self._impulses is not None:
                 kept = np.array(self.impulses()) * (chosen == 0)[:, None, None]
-                copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, 1)
+                copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, True)
             self._engine.copy_chosen(self._initial, self._particles.current, chosen)
             self._particles.reset_order(environments)
             poses = np.array(self.poses())
@@ -357,6 +366,9 @@ class Simulator:
         self._version += 1
         through = (lambda given: self._follow(given, False).twists) if self._map else None
         array = kernel_actions(actions, self._engine, self.action_dim, through)
+        if not on_device(array):
+            from_host(self._actions, array)
+            array = self._actions
         # Discard the impulses of earlier rollouts.
         self._take_impulses()
         self._particles.step(self._pose, array)
@@ -405,7 +417,7 @@ class Simulator:
     def state(self) -> State:
         """Return the current state, with particles in their original order."""
         poses = cast(np.ndarray, self.poses())
-        state = self._particles.unpack(self._particles.current.to_numpy(), poses)
+        state = self._particles.unpack(to_host(self._particles.current), poses)
         joints = self._joints.cpu().numpy() if on_device(self._joints) else self._joints
         return state if joints is None else replace(state, joints=np.array(joints, np.float64))
 
@@ -439,7 +451,7 @@ class Simulator:
         if stride not in self._observed:
             self._observed[stride] = ti.ndarray(self._runtime.real, shape=size)
         fill(self._observed[stride])
-        return self._observed[stride].to_numpy().reshape(self.batch, count, 6)
+        return to_host(self._observed[stride]).reshape(self.batch, count, 6)
 
     def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Return the poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`.
@@ -503,7 +515,7 @@ class Simulator:
         if held is not None:
             require_finite("joints", held, "joint")
         self._version += 1
-        self._particles.current.from_numpy(packed)
+        from_host(self._particles.current, packed)
         self._particles.reset_order()
         self._joints = held
         self._take_impulses(clear=True)
@@ -513,7 +525,7 @@ class Simulator:
         """Return the initial state of :meth:`reset` and :meth:`rollout`."""
         self._require_runtime()
         order = self._particles.initial
-        state = self._particles.unpack(self._initial.to_numpy(), self._initial_poses.copy(), order)
+        state = self._particles.unpack(to_host(self._initial), self._initial_poses.copy(), order)
         return replace(state, joints=self._initial_joints)
 
     def set_initial_state(self, state: State) -> None:
@@ -760,7 +772,7 @@ class Simulator:
 
     def _adjoint(self, bar: ti.Ndarray, order: np.ndarray | None = None) -> State:
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
-        return self._particles.unpack(bar.to_numpy(), poses, order)
+        return self._particles.unpack(to_host(bar), poses, order)
 
     def _require_fitting(self, scenes: Sequence[Scene]) -> None:
         if len(scenes) != self.batch:
@@ -784,7 +796,7 @@ class Simulator:
         x = np.stack(positions)
         identity = np.broadcast_to(np.eye(3), (*x.shape, 3))
         start = State(x, np.zeros_like(x), np.zeros((*x.shape, 3)), identity, self._initial_poses)
-        self._initial.from_numpy(self._particles.pack(start))
+        from_host(self._initial, self._particles.pack(start))
 
     def _start_manipulators(self) -> None:
         self._initial_poses = initial_poses(self.scenes)
@@ -807,7 +819,7 @@ class Simulator:
     def _place(self, poses: np.ndarray) -> None:
         """Place the manipulators at the start of an episode and clear failures."""
         if self.manipulator_count:
-            copy_numbers(self._pose, 0, np.array(poses).reshape(-1), poses.size, 1)
+            from_host(self._pose, np.ascontiguousarray(poses, np.float64))
         self._engine.place(self._pose, 0, self._pose, 1)
         self._taken = 0
 
@@ -831,7 +843,7 @@ class Simulator:
         """Allocate the pose history of T environment steps; the initial poses are set."""
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         if first.size:
-            copy_numbers(poses, 0, np.array(first).reshape(-1), first.size, 1)
+            from_host(poses, np.ascontiguousarray(first, np.float64))
         return poses
 
     def _require_gradient(self) -> None:

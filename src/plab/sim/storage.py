@@ -25,9 +25,9 @@ from plab.laws.algebra import Series
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim.codegen.bitcode import bitcode_file
 from plab.sim.compiler import ti
-from plab.sim.runtime import Runtime, own_fields
+from plab.sim.runtime import Runtime, copy_memory, own_fields
 from plab.sim.shapes import SURFACES, require_surfaces
-from plab.sim.tensors import Array
+from plab.sim.tensors import NUMPY_TYPES, Array
 
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9); likewise in a state's adjoint."""
@@ -113,6 +113,7 @@ class Storage:
         of :mod:`plab.laws.von_mises` are not used."""
         # Fields that the host reads or writes: number, field, components.
         self.shared: list[tuple[int, ti.Field, int]] = []
+        self._addresses: np.ndarray | None = None
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
         self.adjoint_sums: list[tuple[ti.Field, int]] = []
         self.full_gradient = full_gradient
@@ -326,39 +327,44 @@ class Storage:
         self.shared.append((len(self.shared), field, getattr(field, "n", 0)))
         return field
 
-    def write(self, field: ti.Field, values: ArrayLike) -> None:
-        """Write all entries of a shared field, given numbers with the field's leading shape."""
-        self._copy_field(field, np.asarray(values).reshape(-1), 1)
-
     def read(self, field: ti.Field) -> np.ndarray:
         """Return all entries of a shared one-dimensional field of numbers."""
-        out = np.zeros(field.shape)
-        self._copy_field(field, out, 0)
-        return out
+        if self._addresses is None:
+            self._addresses = np.zeros(len(self.shared), np.int64)
+            self._find_fields(self._addresses)
+        out = np.zeros(field.shape, NUMPY_TYPES[field.dtype])
+        copy_memory(int(self._addresses[self._number_of(field)]), out, False)
+        return out.astype(np.float64)
 
-    def _copy_field(self, field: ti.Field, numbers: np.ndarray, writes: int) -> None:
-        which = next(number for number, own, _ in self.shared if own is field)
-        entries = math.prod(field.shape)
+    @ti.kernel
+    def _find_fields(self, out: Array):
+        for number, field, size in ti.static(self.shared):
+            if ti.static(size == 0 and len(field.shape) == 1):
+                out[number] = ti.cast(ti.get_addr(field, 0), ti.i64)
+
+    def _number_of(self, field: ti.Field) -> int:
+        return next(number for number, own, _ in self.shared if own is field)
+
+    def write(self, field: ti.Field, values: ArrayLike) -> None:
+        """Write all entries of a shared field, given numbers with the field's leading shape."""
+        numbers, entries = np.asarray(values).reshape(-1), math.prod(field.shape)
         size = numbers.size // entries
         for first in range(0, entries, PIECE):
             count = min(PIECE, entries - first)
-            piece = numbers[first * size : (first + count) * size]
-            # Copy, because kernels may write to their arrays.
-            self.copy_entries(which, writes, piece.astype(np.float64) if writes else piece, first, count)
+            # Copy, because Taichi assumes that kernels write to their arrays.
+            piece = numbers[first * size : (first + count) * size].astype(np.float64)
+            self.write_entries(self._number_of(field), piece, first, count)
 
     @ti.kernel
-    def copy_entries(self, which: ti.i32, writes: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
-        """Copy an array to some entries of the shared field with this number, or from them."""
+    def write_entries(self, which: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
+        """Copy an array to some entries of the shared field with this number."""
         for i in range(count):
             for number, field, size in ti.static(self.shared):
                 if which == number:
                     at = first + i
                     row, column = at // field.shape[-1], at % field.shape[-1]
                     if ti.static(size == 0 and len(field.shape) == 1):
-                        if writes != 0:
-                            field[at] = ti.cast(numbers[i], field.dtype)
-                        else:
-                            numbers[i] = ti.cast(field[at], ti.f64)
+                        field[at] = ti.cast(numbers[i], field.dtype)
                     elif ti.static(size == 0):
                         field[row, column] = ti.cast(numbers[i], field.dtype)
                     for c in ti.static(range(size)):

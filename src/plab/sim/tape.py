@@ -404,7 +404,7 @@ def closed_loop(
         if t < steps:
             through = moved if simulator._map else None
             given = kernel_actions(chosen, engine, simulator.action_dim, through)
-            copy_numbers(actions, t * row, given, row, 1)
+            copy_numbers(actions, t * row, given, row, True)
 
     def react_at(t: int) -> tuple[Any, Any] | None:
         """Return the derivatives with respect to the observation before step t, or the last observation,

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
-from plab.sim.compiler import ti
+from plab.sim.compiler import address_of, ti
+from plab.sim.runtime import copy_memory
 
 # Kernel arguments: Taichi or NumPy arrays or CUDA tensors, of numbers or of vectors.
 if TYPE_CHECKING:
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     Array = Any
 else:
     Array = ti.types.ndarray(ndim=1)
+
+
+NUMPY_TYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}
+"""NumPy's types of the numbers in arrays and fields."""
 
 
 def on_device(array: object) -> "TypeIs[torch.Tensor]":
@@ -47,14 +52,37 @@ class Constants:
 
 
 @ti.kernel
-def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, writes: ti.i32):
-    """Copy numbers to or from an array, starting at its entry ``first``. All arrays share one kernel, because
-    loading a kernel takes a tenth of a second on CUDA."""
+def _copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, writes: ti.i32):
     for i in range(count):
         if writes != 0:
             array[first + i] = numbers[i]
         else:
             numbers[i] = array[first + i]
+
+
+def copy_numbers(array: ti.Ndarray, first: int, numbers: Any, count: int, writes: bool) -> None:
+    """Copy numbers to or from a device array, starting at its entry ``first``.
+
+    NumPy arrays of the same type are copied as memory, because kernels take time to load and to launch. All
+    other arrays share one kernel.
+    """
+    if isinstance(numbers, np.ndarray):
+        assert numbers.flags.c_contiguous and numbers.dtype == NUMPY_TYPES[array.dtype]
+        copy_memory(address_of(array) + first * numbers.itemsize, numbers[:count], writes)
+    else:
+        _copy_numbers(array, first, numbers, count, writes)
+
+
+def from_host(array: ti.Ndarray, numbers: np.ndarray) -> None:
+    """Copy an array of the same type and number of entries to a device array of numbers or vectors."""
+    copy_numbers(array, 0, numbers.reshape(-1), numbers.size, True)
+
+
+def to_host(array: ti.Ndarray) -> np.ndarray:
+    """Return a device array of numbers or vectors."""
+    out = np.empty((*array.shape, *array.element_shape), NUMPY_TYPES[array.dtype])
+    copy_numbers(array, 0, out.reshape(-1), out.size, False)
+    return out
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
@@ -85,11 +113,11 @@ def numbers_of(
     like the CUDA tensor ``like``."""
     count = int(np.prod(shape))
     if on_device(like):
-        filled = output_for(lambda out: copy_numbers(array, first, out, count, 0), count, True, like)
+        filled = output_for(lambda out: copy_numbers(array, first, out, count, False), count, True, like)
         return filled.reshape(shape)
     out = np.zeros(shape)
     if count:
-        copy_numbers(array, first, out.reshape(-1), count, 0)
+        copy_numbers(array, first, out.reshape(-1), count, False)
     return out
 
 
@@ -104,8 +132,8 @@ def kernel_actions(
     """Return actions for the kernels, flat and in float64.
 
     Args:
-        actions: Actions of one environment step, shape [batch, component], which stay on their device; or of
-            a rollout, shape [batch, T, component], which become a Taichi array ordered by step.
+        actions: Actions of one environment step, shape [batch, component], which stay where they are; or of a
+            rollout, shape [batch, T, component], which become a Taichi array ordered by step.
         engine: The kernels.
         components: Number of components.
         through: Function that converts checked actions, shape [T, batch, component], to actions of the
@@ -126,12 +154,11 @@ def kernel_actions(
     if stays and not rollout and _in_default_stream():
         return numbers
     if not (rollout or stays):
-        # Copy, because Taichi assumes that kernels may write to arrays.
-        return np.append(numbers, np.zeros(0 if count else 1))
+        return numbers
     # Another stream might reuse a tensor's memory before the kernels have read it.
     array = ti.ndarray(ti.f64, shape=max(1, count))
     if count:
-        copy_numbers(array, 0, numbers, count, 1)
+        copy_numbers(array, 0, numbers, count, True)
     if stays and not _in_default_stream():
         ti.sync()
     return array
