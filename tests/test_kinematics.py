@@ -109,7 +109,7 @@ def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
         if link.shape == "CapsuleLink":
             np.testing.assert_allclose(frame[:3, 1], axes[:, 2], atol=1e-10)
     scene = small(*link_manipulators(chain, 1.0), kinematics=chain)
-    found = JointActions([scene]).frames(torch.tensor(joints)[None, None])[0, 0]
+    found = JointActions([scene]).frames(torch.tensor(joints)[:, None, None])[..., 0, 0]
     np.testing.assert_allclose(mount @ found.numpy(), frames, atol=1e-12)
 
 

@@ -2,8 +2,9 @@
 
 In an environment step every joint moves by its share of the action, within its limits. Forward kinematics
 gives the frames of the links before and after; a link's twist is its displacement and the logarithm of its
-relative rotation, so that its final pose is exact. On the CPU, results are bitwise independent of the number
-of environments, because products of small matrices and sums over one dimension are computed in order.
+relative rotation, so that its final pose is exact. Steps and environments are the last dimensions, because
+products of many small matrices are slow. On the CPU, results are bitwise independent of their number, because
+operations are elementwise, or sums over another dimension.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from plab.kinematics.chain import Chain
     from plab.scenes import Scene
 
-__all__ = ["JointActions", "LinkMotion", "rotation_vector"]
+__all__ = ["JointActions", "LinkMotion"]
 
 
 class LinkMotion:
@@ -77,14 +78,17 @@ class JointActions:
             "carriers": [order.index(k.parent) + 1 if k.parent >= 0 else 0 for k in first.links],
             **{f"parents{k}": [levels[k].index(j) for j in parents] for k, parents in enumerate(below)},
         }
+        # Environments are the last dimension; the one before it is the step.
         self._arrays = {
-            name: np.array([[getattr(joint, name) for joint in chain.joints] for chain in chains], float)
-            for name in ("low", "high", "scale", "start")
+            name: np.array([[getattr(joint, name) for joint in chain.joints] for chain in chains], float).T
+            for name in ("low", "high", "scale")
         }
-        self.start = self._arrays["start"]
         motions = np.array([[chain.joints[j].motion() for j in order] for chain in chains])
-        self._arrays["motions"] = motions.reshape(*motions.shape[:2], 4, 16)
-        self._arrays["links"] = np.array([[link.offset for link in chain.links] for chain in chains])
+        offsets = np.array([[link.offset for link in chain.links] for chain in chains])
+        for name, values in {"motions": motions, "offsets": offsets}.items():
+            self._arrays[name] = np.moveaxis(values, 0, -1)[..., None, :].copy()
+        self._arrays["still"] = np.eye(4)[None, ..., None, None]
+        self.start = np.array([[joint.start for joint in chain.joints] for chain in chains])
         self._constants: dict[torch.device, dict[str, Tensor]] = {}
 
     def drive(self, joints: Any, actions: Any, gradient: bool = True) -> LinkMotion:
@@ -99,51 +103,57 @@ class JointActions:
         before = torch.as_tensor(joints).detach().to(given).requires_grad_()
         with torch.set_grad_enabled(gradient):
             c = self._on(given.device)
-            moves = given[..., self._direct :].clamp(-1.0, 1.0).index_select(-1, c["component"]) * c["scale"]
-            at = [before]
-            for move in moves:
+            own = given[..., self._direct :].clamp(-1.0, 1.0).permute(2, 0, 1)
+            moves = own.index_select(0, c["component"]) * c["scale"][:, None]
+            at = [before.T]
+            for move in moves.unbind(1):
                 at.append((at[-1] + move).clamp(c["low"], c["high"]))
-            frames = self.frames(torch.stack(at))
-            turned = rotation_vector(frames[1:, ..., :3, :3] @ frames[:-1, ..., :3, :3].mT)
-            twists = torch.cat([frames[1:, ..., :3, 3] - frames[:-1, ..., :3, 3], turned], dim=-1)
-            raw = torch.cat([given[..., : self._direct], twists.flatten(2)], dim=-1)
-        return LinkMotion([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
+            frames = self.frames(torch.stack(at, 1))
+            twists = _twists(frames[..., :-1, :], frames[..., 1:, :]).flatten(0, 1).permute(1, 2, 0)
+            raw = torch.cat([given[..., : self._direct], twists], dim=-1)
+        return LinkMotion([given, before], [raw, at[-1].T], not isinstance(actions, Tensor))
 
     def frames(self, joints: Tensor) -> Tensor:
-        """Transforms from the links' frames to the world, shape [T, batch, link, 4, 4], given joint
-        positions, shape [T, batch, joint]."""
+        """Transforms from the links' frames to the world, shape [link, 4, 4, T, batch], given joint
+        positions, shape [joint, T, batch]."""
         c = self._on(joints.device)
-        positions = joints.index_select(-1, c["order"])
-        factors = torch.stack(
-            [torch.ones_like(positions), positions.sin(), 1.0 - positions.cos(), positions], dim=-1
-        )
-        own = (factors.unsqueeze(-2) @ c["motions"]).reshape(*positions.shape, 4, 4).split(self._sizes, dim=2)
+        at = joints.index_select(0, c["order"])[:, None, None]
+        still, sine, cosine, slide = c["motions"].unbind(1)
+        moved = still + at.sin() * sine + (1.0 - at.cos()) * cosine + at * slide
+        own = moved.split(self._sizes)
         world = [own[0]]
         for k, frames in enumerate(own[1:]):
-            world.append(world[-1].index_select(2, c[f"parents{k}"]) @ frames)
-        still = c["eye"].expand(*joints.shape[:2], 1, 4, 4)
-        return torch.cat([still, *world], dim=2).index_select(2, c["carriers"]) @ c["links"]
+            world.append(_product(world[-1].index_select(0, c[f"parents{k}"]), frames))
+        carriers = torch.cat([c["still"].expand(1, *own[0].shape[1:]), *world])
+        return _product(carriers.index_select(0, c["carriers"]), c["offsets"])
 
     def _on(self, device: torch.device) -> dict[str, Tensor]:
         """Chain constants on a device."""
         if device not in self._constants:
             c = {name: torch.tensor(array, device=device) for name, array in self._arrays.items()}
-            c["eye"] = torch.eye(4, dtype=torch.float64, device=device)
             c |= {name: torch.tensor(index, device=device) for name, index in self._indices.items()}
             self._constants[device] = c
         return self._constants[device]
 
 
-def rotation_vector(turn: Tensor) -> Tensor:
-    """Logarithm, shape [..., 3], of rotation matrices, shape [..., 3, 3], with angles below pi."""
-    skew = 0.5 * (turn - turn.transpose(-1, -2))
-    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    square = axis[..., 0] ** 2 + axis[..., 1] ** 2 + axis[..., 2] ** 2
-    cosine = 0.5 * (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1.0)
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Products of matrices, shape [N, 4, 4, T, batch]."""
+    return (first.unsqueeze(3) * second.unsqueeze(1)).sum(2)
+
+
+def _twists(old: Tensor, new: Tensor) -> Tensor:
+    """Twists, shape [N, 6, T, batch], from old to new frames, shape [N, 4, 4, T, batch], turned by less than
+    pi."""
+    # Relative rotation and its logarithm.
+    turn = (new[:, :3, None, :3] * old[:, None, :3, :3]).sum(3)
+    skew = 0.5 * (turn - turn.transpose(1, 2))
+    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
+    square = axis[:, 0] ** 2 + axis[:, 1] ** 2 + axis[:, 2] ** 2
+    cosine = 0.5 * (turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] - 1.0)
     small = (square < 1e-8) & (cosine > 0.0)
     sine = torch.where(small, 1.0, square).sqrt()
     # angle / sin(angle), as a series in sin(angle)^2 near 0. Not by atan2, whose last bits depend on the
     # number of elements.
     angle = 2.0 * torch.atan(sine / (1.0 + cosine))
     ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, angle / sine)
-    return ratio[..., None] * axis
+    return torch.cat([new[:, :3, 3] - old[:, :3, 3], ratio[:, None] * axis], dim=1)
