@@ -24,14 +24,27 @@ def test_steps_of_many_launches_agree_with_the_cpu(monkeypatch: pytest.MonkeyPat
     assert_cuda_agrees_with_the_cpu("nearest")
 
 
+def test_strong_momentum_is_within_range_of_the_integers() -> None:
+    """A spinning particle contributes momentum above 2^13 particle masses x domain units / s to nodes."""
+    positions = []
+    for device in ("cpu", "cuda"):
+        simulator = simulator_of([1], "float32", "nearest", device=device)
+        start = simulator.state()
+        start.C[0, 5] = 3e4 * np.array([[0, 1, -1], [-1, 0, 1], [1, -1, 0]])
+        simulator.set_initial_state(start)
+        simulator.rollout(actions_of([1]))
+        positions.append(np.array(simulator.state().x))
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-5)
+
+
 def test_a_broken_state_is_still_found() -> None:
-    """Detect values that exceed a node's integers: a velocity, and unlimited stress."""
-    fast, strained = 1, 10
-    simulator = simulator_of([0, fast, strained], "float32", "nearest")
+    """Detect values that exceed a node's integers: a velocity, and a velocity gradient."""
+    fast, spinning = 1, 10
+    simulator = simulator_of([0, fast, spinning], "float32", "nearest")
     start = simulator.state()
     start.v[1, 5, 0] = 1e6
-    start.F[2, 5] = 1e4 * np.eye(3)
+    start.C[2, 5] = 1e7 * np.eye(3)
     simulator.set_initial_state(start)
-    result = simulator.rollout(actions_of([0, fast, strained]), strict=False)
+    result = simulator.rollout(actions_of([0, fast, spinning]), strict=False)
     assert set(result.failures) == {1, 2}
     assert all("environment step 1, substep 1" in failure for failure in result.failures.values())

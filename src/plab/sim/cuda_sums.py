@@ -20,12 +20,12 @@ from plab.sim.compiler import bitcode_function, local_variable, ti
 from plab.sim.particle_phases import TYPE_SUFFIXES
 from plab.sim.storage import Storage
 
-MOMENTUM_BITS, MASS_BITS = 36, 42
+MOMENTUM_BITS, MASS_BITS = 32, 42
 """Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""
 
-MOMENTUM_RANGE = 13
+MOMENTUM_RANGE = 18
 """Bits before the point of a particle's contribution to a node's momentum, of which 2^13 can be added; larger
-values occur only in diverged states."""
+values count as divergence. Strongly strained particles reach 2^13."""
 
 ADJOINT_BITS = 46
 """Bits of a contribution to a node's adjoint, relative to the largest of the environment: 2^15 largest ones
@@ -35,7 +35,7 @@ REST_BITS = 49
 """Bits of a float64 simulator's second integer, for the remainders of the first, of which 2^14 can be
 added."""
 
-WIDER = 24
+WIDER = 19
 """Bits that float64 has more before the point of momentum, and fewer after the point of its first integer."""
 
 WORD_UNITS = (2.0**30, 2.0**-12, 2.0**-54, 2.0**-96)
