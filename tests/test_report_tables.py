@@ -294,7 +294,6 @@ AGREEMENT = {
         "TD3": ("50", "0.64", "94 %"),
         "SAC": ("50", "0.54", "92 %"),
     },
-    "targets": {"all": ("150", "0.45", "43 %")},
 }
 """Number of cells, correlation with the paper and agreement; also in docs/reproduction.md."""
 

@@ -106,7 +106,7 @@ def load(
 
     Args:
         source: A folder, including subfolders, an archive, a single result file, or several of them; the
-            names ``example``, ``release``, ``targets`` and ``authors`` are bundled archives.
+            names ``example``, ``release`` and ``authors`` are bundled archives.
         keys: Dotted configuration keys to add as columns, such as ``task.yield_stress``.
         index: Whether to use and update the index of the folder.
 

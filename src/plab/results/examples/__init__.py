@@ -9,10 +9,10 @@ from pathlib import Path
 
 __all__ = ["EXAMPLES", "example_archive", "measurements", "resolve"]
 
-EXAMPLES = ("example", "release", "targets", "authors")
+EXAMPLES = ("example", "release", "authors")
 """Names of the bundled archives, accepted in place of a results folder: plab's own suite, the paper's
-benchmark under the release's protocol, plab's protocol on the authors' targets, and `solve` on these targets
-with the release's initial particles."""
+benchmark under the release's protocol, and `solve` on the authors' targets with the release's initial
+particles."""
 
 
 def example_archive(name: str = EXAMPLES[0]) -> Path:
