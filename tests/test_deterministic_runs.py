@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuda_scenes import ALL, assert_agreement, assert_same_bits, computed, results_of, simulator_of
+from cuda_scenes import (
+    ALL,
+    actions_of,
+    assert_agreement,
+    assert_same_bits,
+    computed,
+    results_of,
+    simulator_of,
+)
 from plab.config import load_config
 from plab.problem import Problem
 from plab.results import read
@@ -23,6 +31,19 @@ def test_float64_has_the_same_bits_and_computes_what_the_cpu_does() -> None:
     got, again = results_of(ALL, "float64", "all", times=2)
     assert_same_bits(again, got)
     assert_agreement(got, computed(simulator_of(ALL, "float64", "all", device="cpu")), 1e-10)
+
+
+def test_strong_momentum_is_within_range_of_the_integers() -> None:
+    """A spinning particle contributes momentum above 2^13 particle masses x domain units / s to nodes."""
+    positions = []
+    for device in ("cpu", "cuda"):
+        simulator = simulator_of([1], "float32", "nearest", device=device)
+        start = simulator.state()
+        start.C[0, 5] = 3e4 * np.array([[0, 1, -1], [-1, 0, 1], [1, -1, 0]])
+        simulator.set_initial_state(start)
+        simulator.rollout(actions_of([1]))
+        positions.append(np.array(simulator.state().x))
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-5)
 
 
 def test_a_thousand_steps_and_their_gradient_have_the_same_bits() -> None:
