@@ -317,14 +317,14 @@ class Problem:
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
         return BatchMeasures(measures, loss[:, -1], result.gradient, result.failures)
 
-    def iou_gradient(self, actions: torch.Tensor, diverged: list[int]) -> torch.Tensor:
+    def iou_gradient(self, actions: torch.Tensor) -> tuple[torch.Tensor, dict[int, str]]:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
-        actions of that shape; 0 for ``diverged`` episodes and for those whose gradient diverges."""
+        actions of that shape, and the diverged episodes with reasons; their gradient is 0."""
         from plab.plugins import torch
 
-        left, given = set(diverged), actions.clone()
+        failures, given = dict[int, str](), actions.clone()
         while True:
-            given[list(left)] = 0.0
+            given[list(failures)] = 0.0
             try:
                 recorded = self.simulator.record(given if given.is_cuda else given.numpy(), every_step=False)
                 mass = torch.as_tensor(recorded.mass).double().requires_grad_()
@@ -336,12 +336,12 @@ class Problem:
                 out = torch.as_tensor(recorded.pullback(mass=slope if given.is_cuda else slope.numpy()))
             except SimulationError as error:
                 # An episode without actions may diverge, too.
-                if left.issuperset(error.failures):
+                if failures.keys() >= error.failures.keys():
                     raise
-                left |= set(error.failures)
+                failures |= error.failures
                 continue
-            out[list(left)] = 0.0
-            return out
+            out[list(failures)] = 0.0
+            return out, failures
 
     def rollout(
         self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True

@@ -76,8 +76,9 @@ class Answer:
     """Evaluation of candidates.
 
     Attributes:
-        measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
-        final_loss: Loss of the last step, shape [P].
+        measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each; none with the
+            gradient of ``score``.
+        final_loss: Loss of the last step, shape [P]; 0 with the gradient of ``score``.
         gradient: Requested gradient, shape [P, T, A], 0 for diverged candidates; None if not requested.
         broken: Diverged candidates, shape [P], bool; their values are meaningless.
     """
@@ -347,15 +348,19 @@ class PlannerRunner(Runner):
         parts: dict[str, list[Tensor]] = defaultdict(list)
         for part in tried.split(width):
             flat = part.flatten(0, 1)
-            trials = self.problem.evaluate_actions(flat, gradient=first.gradient == "loss")
-            gradient = trials.gradient
-            if first.gradient == "score":
-                gradient = -self.problem.iou_gradient(flat, list(trials.failures))
             broken = torch.zeros(part.shape[:2].numel(), dtype=torch.bool, device=self._device)
-            broken[list(trials.failures)] = True
-            reasons |= {e % len(self.tracks): text for e, text in trials.failures.items()}
-            given = trials.measures | {"final": trials.final_loss, "broken": broken}
-            for name, values in (given | ({"gradient": gradient} if first.gradient else {})).items():
+            given: dict[str, Any] = {"broken": broken, "final": torch.zeros_like(broken, dtype=torch.float64)}
+            if first.gradient == "score":
+                slope, failures = self.problem.iou_gradient(flat)
+                given |= {"gradient": -slope}
+            else:
+                trials = self.problem.evaluate_actions(flat, gradient=first.gradient == "loss")
+                failures = trials.failures
+                given |= trials.measures | {"final": trials.final_loss}
+                given |= {"gradient": trials.gradient} if first.gradient else {}
+            broken[list(failures)] = True
+            reasons |= {e % len(self.tracks): text for e, text in failures.items()}
+            for name, values in given.items():
                 parts[name].append(torch.as_tensor(values).reshape(*part.shape[:2], *values.shape[1:]))
         whole = {name: torch.cat(rows)[:count] for name, rows in parts.items()}
         answers = {}
