@@ -240,6 +240,8 @@ def test_memory_is_checked(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> N
             sim.rollout(ACTIONS)
     with monkeypatch.context() as patch:
         patch.setitem(ENTRIES_MAX, sim.device, 1)
+        # As if this number of steps was new.
+        patch.setattr(sim._tape, "_plans", {})
         with pytest.raises(MemoryError, match="more numbers"):
             sim.rollout(ACTIONS)
     scene = replace(ball(), grid_size=256, dt=2e-5, substeps=10)

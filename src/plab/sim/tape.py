@@ -46,6 +46,7 @@ class Tape:
         # Environment steps per segment, and per array of the history.
         self._length = 0
         self._reach = 0
+        self._plans: dict[tuple[int, float], int] = {}
         self.bar: ti.Ndarray | None = None
         self._spare_bar: ti.Ndarray | None = None
 
@@ -76,6 +77,8 @@ class Tape:
         Raises:
             MemoryError: If no length fits into the budget or into arrays that Taichi can address.
         """
+        if found := self._plans.get((steps, memory_mb)):
+            return found
         engine, particles, reach = self._engine, self._particles, self._reach_max
         engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
@@ -100,7 +103,8 @@ class Tape:
                 f"set sim.memory_mb={need} or more"
             )
         # As few segments as possible, because their steps are recomputed.
-        return -(-steps // -(-steps // max(fitting)))
+        length = self._plans[steps, memory_mb] = -(-steps // -(-steps // max(fitting)))
+        return length
 
     def _allocate(self, steps: int) -> None:
         per_slot, segments = self._particles.current.shape[0], -(-steps // self._length)
