@@ -193,6 +193,7 @@ class Problem:
         # Generating a target changes the contact model, loading it from the cache does not.
         self.simulator.set_contact("soft")
         self._held_weights = Constants(self.weights)
+        self._relative_target: tuple[np.ndarray, Constants] | None = None
         self.refresh(kinds)
 
     def refresh(self, kinds: Sequence[str] | None = None) -> None:
@@ -328,8 +329,7 @@ class Problem:
             try:
                 recorded = self.simulator.record(given if given.is_cuda else given.numpy(), every_step=False)
                 mass = torch.as_tensor(recorded.mass).double().requires_grad_()
-                target = torch.as_tensor(self.target_mass).to(mass)[:, None]
-                a, b = (m / m.amax((2, 3, 4), keepdim=True) for m in (mass, target))
+                a, b = mass / mass.amax((2, 3, 4), keepdim=True), self._target_like(mass)
                 both = (a * b).sum((2, 3, 4))
                 iou = both / ((a + b).sum((2, 3, 4)) - both)
                 (slope,) = torch.autograd.grad(iou.sum(), mass)
@@ -342,6 +342,18 @@ class Problem:
                 continue
             out[list(failures)] = 0.0
             return out, failures
+
+    def _target_like(self, mass: torch.Tensor) -> torch.Tensor:
+        """Return the targets' masses relative to the largest of each, shape [batch, 1, n, n, n], on the
+        device of a tensor, to which they are copied once."""
+        from plab.plugins import torch
+
+        known = self._relative_target
+        if known is None or known[0] is not self.target_mass:
+            target = np.asarray(self.target_mass, np.float64)[:, None]
+            known = self.target_mass, Constants(target / target.max((2, 3, 4), keepdims=True))
+            self._relative_target = known
+        return torch.as_tensor(known[1].like(mass))
 
     def rollout(
         self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True

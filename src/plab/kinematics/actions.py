@@ -142,8 +142,8 @@ def _product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _twists(old: Tensor, new: Tensor) -> Tensor:
-    """Twists, shape [N, 6, T, batch], from old to new frames, shape [N, 4, 4, T, batch], turned by less than
-    pi."""
+    """Twists, displacement [domain units] and rotation vector [rad], shape [N, 6, T, batch], from old to new
+    frames, shape [N, 4, 4, T, batch], turned by less than pi."""
     # Relative rotation and its logarithm.
     turn = (new[:, :3, None, :3] * old[:, None, :3, :3]).sum(3)
     skew = 0.5 * (turn - turn.transpose(1, 2))

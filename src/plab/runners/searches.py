@@ -86,12 +86,12 @@ class Multistart(Planner):
             end, last = method.softness_end or method.softness, max(method.iterations - 1, 1)
             softness = method.softness * (end / method.softness) ** (self.iteration / last)
         wanted = "score" if method.objective == "score" else "loss"
-        # The measures of the hard model are shown; the loss's gradient comes with them.
-        with_gradient = wanted if wanted == "loss" and softness is None else ""
-        answer = shown = yield Request(actions, gradient=with_gradient)
+        # The measures of the hard model are shown; the gradient of the loss in this model comes with them.
+        known = wanted == "loss" and softness is None
+        answer = shown = yield Request(actions, gradient="loss" if known else "")
         order = shown.cost(method.objective).argsort(stable=True)
         for update in range(method.updates):
-            if update > 0 or not with_gradient:
+            if update > 0 or not known:
                 answer = yield Request(self.memory["actions"], softness, gradient=wanted)
             assert answer.gradient is not None
             self._descend(answer.gradient)

@@ -366,7 +366,8 @@ class Simulator:
         self._version += 1
         through = (lambda given: self._follow(given, False).twists) if self._map else None
         array = kernel_actions(actions, self._engine, self.action_dim, through)
-        if not on_device(array):
+        # Tensors in another stream than PyTorch's default are in a Taichi array already.
+        if isinstance(array, np.ndarray):
             from_host(self._actions, array)
             array = self._actions
         # Discard the impulses of earlier rollouts.
