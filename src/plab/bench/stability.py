@@ -3,6 +3,7 @@
     plab bench stability                      # everything, in both precisions
     plab bench stability --quick              # a few minutes on two cores
     plab bench stability --precision float32 --csv cases.csv
+    plab bench stability --device cuda
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
 steps, and first variants over 1000 steps. Every case is simulated forwards and backwards. A case passes if
@@ -24,7 +25,7 @@ from plab.cli.command import Parser, command_line, measure_table, print_table, t
 from plab.config import build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms
-from plab.scenes import CONTACTS, PRECISIONS
+from plab.scenes import CONTACTS, DEVICES, PRECISIONS
 from plab.sim import Simulator, State
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
@@ -53,7 +54,7 @@ def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.nda
 ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
 
 
-def rows(precision: str, quick: bool) -> Iterator[dict[str, object]]:
+def rows(precision: str, quick: bool, device: str) -> Iterator[dict[str, object]]:
     """Run all cases, one task at a time; yield a row of :data:`COLUMNS` per case."""
     tasks, number = suite_tasks(), itertools.count(1)
     short = [("suite", task, SUITE_VARIANTS[:1] if quick else SUITE_VARIANTS, 50) for task in tasks]
@@ -65,17 +66,19 @@ def rows(precision: str, quick: bool) -> Iterator[dict[str, object]]:
         scenes = [built[variant] for variant, *_ in cases]
         size = scenes[0].action_dim
         actions = [ACTIONS[kind](np.random.default_rng(next(number)), steps, size) for _, kind, _ in cases]
-        simulator = stress_simulator(scenes, precision, contact_weight=1.0)
+        simulator = stress_simulator(scenes, precision, contact_weight=1.0, device=device)
         simulator.set_contact([contact for *_, contact in cases])
         for (variant, kind, contact), found in zip(cases, stress(simulator, np.stack(actions)), strict=True):
             name = f"{task}-v{variant} {kind} {contact}"
             yield {"precision": precision, "family": family, "case": name, **found}
 
 
-def stress_simulator(scenes: Sequence[Any], precision: str, contact_weight: float) -> Simulator:
+def stress_simulator(
+    scenes: Sequence[Any], precision: str, contact_weight: float, device: str = "cpu"
+) -> Simulator:
     """Return a simulator of some scenes whose target is a ball in the centre."""
     terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": contact_weight})
-    simulator = Simulator(scenes, terms=terms, precision=precision)
+    simulator = Simulator(scenes, terms=terms, precision=precision, device=device)
     n = simulator.grid_size
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(nodes - (0.5, 0.3, 0.5), axis=-1) - 0.15
@@ -143,7 +146,8 @@ def main(argv: Sequence[str]) -> int:
     what = "one variant of each task, 64 particles instead of 300"
     parser.add_argument("--quick", action="store_true", help=what)
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
+    parser.add_argument("--device", choices=DEVICES, default="cpu")
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     options = parser.parse_intermixed_args(argv)
-    each = (rows(precision, options.quick) for precision in options.precision)
+    each = (rows(precision, options.quick, options.device) for precision in options.precision)
     return summarise(measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv))

@@ -320,10 +320,29 @@ class CudaPhases(OrderPhases, PosePhases):
         return mask
 
     @ti.func
-    def accumulate_frame(self, grid_index, m, entry, value):
-        """Add to a frame's adjoint; ``grid_index`` identifies environment and substep."""
-        at = (grid_index * self.manipulators + m) * FRAME_ADJOINT + entry
-        self.add_up(self.frame_sums, at, ti.cast(value, ti.f64))
+    def contacts_adjoint(self, grid_index, e, s, i, free, near, bar):
+        """As :meth:`plab.sim.grid_phases.GridPhases.contacts_adjoint`, for 32 nodes of a block; all lanes of
+        a warp must take part, and the adjoint of a frame is summed over them first. ``grid_index`` identifies
+        environment and substep."""
+        out, some, x = bar, near, self.position(i)
+        lane = self.index_in_block(i) % WARP
+        for k in ti.static(range(RUN_BITS if self.manipulators else 0)):
+            some = some | ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), some, 1 << k)
+        for shape, start, stop in ti.static(tuple(reversed(self.shape_ranges))):
+            for back in range(stop - start):
+                m = stop - 1 - back
+                if some & (1 << m):
+                    frame = ti.Vector.zero(self.real, ti.static(self.frame_numbers(shape)))
+                    if near & (1 << m):
+                        v = self.after_manipulators(e, s, x, free, near, m)
+                        own, _touches = self.contact_adjoint(shape, grid_index, e, s, m, x, v, out, frame)
+                        out = own
+                    if ti.static(self.moves(shape)):
+                        total = self.sums_of_warp(frame, lane, ti.static(self.frame_numbers(shape)))
+                        if lane < ti.static(self.frame_numbers(shape)):
+                            at = (grid_index * self.manipulators + m) * FRAME_ADJOINT + lane
+                            self.add_up(self.frame_sums, at, ti.cast(total, ti.f64))
+        return out
 
     @ti.func
     def accumulate_world(self, grid_index, e, entry, value):

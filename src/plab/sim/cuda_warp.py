@@ -202,6 +202,40 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
             out += self.wide_from_above(out, 1 << k)
         return out
 
+    @ti.func
+    def from_opposite(self, value, step: ti.template()):
+        """Return the number of the lane whose index differs in one bit."""
+        out = value
+        if ti.static(self.real == ti.f32):
+            bits = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), ti.bit_cast(value, ti.i32), step)
+            out = ti.bit_cast(bits, ti.f32)
+        else:
+            bits = ti.bit_cast(value, ti.i64)
+            low = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), step)
+            high = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), step)
+            out = ti.bit_cast((ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64), ti.f64)
+        return out
+
+    @ti.func
+    def sums_of_warp(self, values: ti.template(), lane, count: ti.template()):
+        """Sum ``count`` numbers over the lanes of a warp, and return the sum of number ``lane`` in each lane
+        below ``count``."""
+        width = ti.static(1 << (count - 1).bit_length())
+        rest = ti.Vector.zero(self.real, width)
+        for k in ti.static(range(count)):
+            rest[k] = values[k]
+        # Opposite lanes exchange halves of their numbers.
+        for bit in ti.static(range((count - 1).bit_length() - 1, -1, -1)):
+            upper = (lane >> bit) & 1 != 0
+            for k in ti.static(range(1 << bit)):
+                kept = ti.select(upper, rest[k + (1 << bit)], rest[k])
+                given = ti.select(upper, rest[k], rest[k + (1 << bit)])
+                rest[k] = kept + self.from_opposite(given, ti.static(1 << bit))
+        out = rest[0]
+        for bit in ti.static(range((count - 1).bit_length(), RUN_BITS)):
+            out += self.from_opposite(out, ti.static(1 << bit))
+        return out
+
     # -- scatter by runs ----------------------------------------------------------------------------
     #
     # Particles are in the order of their cells at the start, and neighbours stay neighbours, so that the

@@ -80,6 +80,11 @@ class GridPhases(Storage):
         return corner + ti.Vector([r // (BLOCK * BLOCK), (r // BLOCK) % BLOCK, r % BLOCK])
 
     @ti.func
+    def index_in_block(self, i):
+        """Index r of a node within its block, from its array index."""
+        return (i[0] % BLOCK * BLOCK + i[1] % BLOCK) * BLOCK + i[2] % BLOCK
+
+    @ti.func
     def linear(self, i):
         """Linear index of a node in its grid, from its array index."""
         return (i[0] * self.axis + i[1]) * self.axis + i[2]
@@ -178,9 +183,10 @@ class GridPhases(Storage):
         return out
 
     @ti.func
-    def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):
-        """Adjoint of v under :meth:`contact`; accumulates the frame's adjoint."""
-        out = bar
+    def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar, frame: ti.template()):
+        """Adjoint of v under :meth:`contact`, and whether there is contact; if so, writes the frame's adjoint
+        to ``frame``."""
+        out, touches = bar, False
         offset = x - self.frame_centre[e, s, m]
         p = self.into_frame(shape, e, s, m, offset)
         gap = self.frame_gap[e, s, m]
@@ -206,18 +212,32 @@ class GridPhases(Storage):
                 d_bar = 0.0 * d
                 if d > 0.0:
                     d_bar = -self.alpha[e] * strength * bar.dot(t - r)
-                self.frame_adjoint(
-                    shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar
-                )
-                out = r_bar
-        return out
+                self.frame_adjoint(shape, frame, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar)
+                out, touches = r_bar, True
+        return out, touches
+
+    def frame_numbers(self, shape: str) -> int:
+        """Number of components of a frame's adjoint that a shape has."""
+        if MANIPULATOR_SHAPES[shape].grips:
+            return AT_FRAME_GAP + 1
+        return AT_FRAME_GAP if self.turns(shape) else AT_FRAME_ROTATION
 
     @ti.func
     def frame_adjoint(
-        self, shape: ti.template(), grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, u_bar
+        self,
+        shape: ti.template(),
+        frame: ti.template(),
+        e,
+        s,
+        m,
+        offset,
+        p,
+        n_local,
+        normal_bar,
+        d_bar,
+        u_bar,
     ):
-        """Accumulate the adjoint of manipulator m's frame from those of normal, distance and rigid
-        velocity."""
+        """Write the adjoint of manipulator m's frame, given those of normal, distance and rigid velocity."""
         if ti.static(self.moves(shape)):
             size = self.size[e, m]
             gap = self.frame_gap[e, s, m]
@@ -228,15 +248,34 @@ class GridPhases(Storage):
                 p_bar += self.frame_spin[e, s, m].transpose() @ u_bar
             centre_bar = -self.out_of_frame(shape, e, s, m, p_bar)
             for i in ti.static(range(3)):
-                self.accumulate_frame(grid_index, m, i, centre_bar[i])
-                self.accumulate_frame(grid_index, m, AT_FRAME_VELOCITY + i, u_bar[i])
+                frame[i] = centre_bar[i]
+                frame[AT_FRAME_VELOCITY + i] = u_bar[i]
                 if ti.static(self.turns(shape)):
                     for j in ti.static(range(3)):
                         turned = normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
-                        self.accumulate_frame(grid_index, m, AT_FRAME_ROTATION + 3 * i + j, turned)
-                        self.accumulate_frame(grid_index, m, AT_FRAME_SPIN + 3 * i + j, u_bar[i] * p[j])
+                        frame[AT_FRAME_ROTATION + 3 * i + j] = turned
+                        frame[AT_FRAME_SPIN + 3 * i + j] = u_bar[i] * p[j]
             if ti.static(MANIPULATOR_SHAPES[shape].grips):
-                self.accumulate_frame(grid_index, m, AT_FRAME_GAP, gap_slope(shape, p) * from_distance[0])
+                frame[AT_FRAME_GAP] = gap_slope(shape, p) * from_distance[0]
+
+    @ti.func
+    def contacts_adjoint(self, grid_index, e, s, i, free, near, bar):
+        """Adjoint of a node's velocity ``free`` under contact with the manipulators in the mask ``near``;
+        their frames' adjoints are accumulated."""
+        out, x = bar, self.position(i)
+        for shape, start, stop in ti.static(tuple(reversed(self.shape_ranges))):
+            for back in range(stop - start):
+                m = stop - 1 - back
+                if near & (1 << m):
+                    # Few manipulators are near a node, so recomputing contact with those before m is cheaper
+                    # than storing it.
+                    v = self.after_manipulators(e, s, x, free, near, m)
+                    frame = ti.Vector.zero(self.real, ti.static(self.frame_numbers(shape)))
+                    out, touches = self.contact_adjoint(shape, grid_index, e, s, m, x, v, out, frame)
+                    if touches:
+                        for k in ti.static(range(self.frame_numbers(shape))):
+                            self.accumulate_frame(grid_index, m, k, frame[k])
+        return out
 
     # -- walls --------------------------------------------------------------------------------------
 
@@ -372,24 +411,18 @@ class GridPhases(Storage):
         """
         v_out = bar * 0.0
         out = total * 0.0
+        free, v_bar, touched = v_out, v_out, 0
         if total[3] > MASS_MIN:
             free = self.free_velocity(e, total)
-            x = self.position(i)
             v = free
             if near != 0:
-                v = self.after_manipulators(e, s, x, free, near, self.manipulators)
+                touched = near
+                v = self.after_manipulators(e, s, self.position(i), free, near, self.manipulators)
             friction = self.material[e][0]
             v_out = self.walls(i, v, friction)
             v_bar = self.walls_adjoint(grid_index, e, i, v, friction, bar)
-            if near != 0:
-                for shape, start, stop in ti.static(tuple(reversed(self.shape_ranges))):
-                    for back in range(stop - start):
-                        m = stop - 1 - back
-                        if near & (1 << m):
-                            # Few manipulators are near a node, so recomputing contact with those before m is
-                            # cheaper than storing it.
-                            v_in = self.after_manipulators(e, s, x, free, near, m)
-                            v_bar = self.contact_adjoint(shape, grid_index, e, s, m, x, v_in, v_bar)
+        v_bar = self.contacts_adjoint(grid_index, e, s, i, free, touched, v_bar)
+        if total[3] > MASS_MIN:
             mass_bar = 0.0 * total[3]
             for k in ti.static(range(3)):
                 if ti.static(self.full_gradient):

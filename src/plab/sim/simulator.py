@@ -756,8 +756,9 @@ class Simulator:
     ) -> np.ndarray | torch.Tensor:
         """Convert derivatives with respect to manipulator motions to derivatives with respect to actions,
         shape [batch, T, A]."""
-        bar = numbers_of(bars, (steps, self.batch, self._engine.actions_per_step), like)
-        if drive is not None:
+        shape = steps, self.batch, self._engine.actions_per_step
+        bar = numbers_of(bars, shape, drive.twists if drive else like)
+        if drive:
             bar = drive.pull_back(bar)[0]
         return (bar.to(like.dtype) if on_device(bar) else bar).swapaxes(0, 1)
 
@@ -806,7 +807,7 @@ class Simulator:
             # Imported here, because other scenes do not need PyTorch.
             from plab.kinematics.actions import JointActions
 
-            self._map = JointActions(self.scenes)
+            self._map = JointActions(self.scenes, self.device)
         self._initial_joints = self._map.start if self._map else None
 
     def _checked_particles(self, x: ArrayLike, label: str = "particles") -> np.ndarray:
