@@ -4,12 +4,12 @@
     plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
     plab bench accuracy --task Move,Rope --device cuda
 
-Settings differ in the number of substeps (from below the stability limit upwards), precision, material update
-(series or singular values), contact model, and grid (with a constant number of particles per cell). The
-reference for each contact model uses float64 and many more substeps, or the finest grid. Errors are the root
-mean square distance of the final positions [domain units], the L1 distance of the mass tensors relative to
-the mass, the score, and the relative norm and the angle of the gradient. Run times are per environment step
-with gradient, for one environment.
+Settings differ in the number of substeps (from below the stability limit upwards), precision, material
+update (series or singular values), contact model, grid (with a constant number of particles per cell), and,
+for the first task, law. The reference for each contact model and law uses float64 and many more substeps, or
+the finest grid. Errors are the root mean square distance of the final positions [domain units], the L1
+distance of the mass tensors relative to the mass, the score, and the relative norm and the angle of the
+gradient. Run times are per environment step with gradient, for one environment.
 
 The actions are 0.7 times those of a demonstration, and the target is the final state of the demonstration in
 the hard contact model, so that scores correspond to partial success. The loss has the suite's terms of the
@@ -34,7 +34,7 @@ from plab.demonstrations import known_actions
 from plab.losses import make_terms
 from plab.objective import scores, spread_mass, target_sdf
 from plab.plugins import pandas as pd
-from plab.scenes import CONTACTS, DEVICES, PRECISIONS, Body, Scene, sample_particles
+from plab.scenes import CONTACTS, DEVICES, LAWS, PRECISIONS, Body, Scene, sample_particles
 from plab.sim import Simulator
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
@@ -48,7 +48,7 @@ ACTION_SCALE = 0.7
 ERRORS = ("positions", "mass", "score", "gradient", "angle_deg")
 
 COLUMNS = (
-    "axis", "task", "contact", "precision", "material", "grid", "particles", "substeps", "ms_per_step",
+    "axis", "task", "contact", "precision", "material", "law", "grid", "particles", "substeps", "ms_per_step",
     *ERRORS, "outcome",
 )  # fmt: skip
 
@@ -70,6 +70,7 @@ class Setting(NamedTuple):
     substeps: int
     precision: str = "float64"
     material: str = "series"
+    law: str = "von_mises"
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Plan:
     Attributes:
         grid: Grid of the settings that differ in substeps.
         substeps: Substeps of these settings.
-        usual: Number of substeps for comparing the materials.
+        usual: Number of substeps for comparing materials and laws.
         reference: Substeps of the reference.
         grids: Grids; the last and finest is the reference.
         steps: Environment steps.
@@ -96,13 +97,17 @@ class Plan:
     particles: int = 10000
     repeats: int = 2
 
-    def settings(self) -> tuple[list[Setting], dict[str, Setting]]:
-        """Return the settings to compare, and the reference by axis."""
+    def settings(self) -> tuple[list[Setting], dict[tuple[str, str], Setting]]:
+        """Return the settings to compare, and the references by axis and law."""
         # The suite's number of substeps per cell width.
         *coarse, finest = (Setting("grid", n, round(self.usual * n / self.grid)) for n in self.grids)
         out = [Setting("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
         out += [Setting("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
-        return out + coarse, {"substeps": Setting("substeps", self.grid, self.reference), "grid": finest}
+        exact = [Setting("substeps", self.grid, self.reference), finest]
+        for law in sorted(set(LAWS) - {"von_mises"}):
+            out += [Setting("law", self.grid, self.usual, precision, law=law) for precision in PRECISIONS]
+            exact.append(Setting("law", self.grid, self.reference, law=law))
+        return out + coarse, {(setting.axis, setting.law): setting for setting in exact}
 
 
 QUICK = Plan(32, (3, 5, 10, 20), 10, reference=80, grids=(24, 32, 40), steps=20, particles=1000, repeats=1)
@@ -150,7 +155,7 @@ class Attempt:
         cfg = with_particles([f"task={task}", "variant=1"], plan.particles)
         self._scene, self._plan, self._device = build_scene(cfg), plan, device
         self._demonstration = cast(np.ndarray, known_actions(cfg))[: plan.steps]
-        self._ends: dict[str, np.ndarray] = {}
+        self._ends: dict[tuple[str, str], np.ndarray] = {}
 
     def _start(self, setting: Setting) -> tuple[Scene, np.ndarray]:
         """Return the scene of a setting and its particles.
@@ -167,13 +172,15 @@ class Attempt:
             counted = zip(scene.bodies, parts, strict=True)
             scene = replace(scene, bodies=tuple(replace(b, particles=len(own)) for b, own in counted))
             x = np.concatenate(parts)
+        if setting.axis == "law":
+            scene = replace(scene, bodies=tuple(replace(body, law=setting.law) for body in scene.bodies))
         dt = STEP_TIME / setting.substeps
         changes = {"grid_size": setting.grid, "substeps": setting.substeps, "dt": dt}
         return UncheckedScene(**vars(scene) | changes), x
 
     def run(self, setting: Setting, repeats: int) -> dict[str, Result]:
         """Simulate and time one setting; return one result per contact model. The first setting of an axis
-        determines the target, the final state of the demonstration."""
+        and law determines the target, the final state of the demonstration."""
         scene, x = self._start(setting)
         simulator = Simulator(
             [scene],
@@ -184,11 +191,12 @@ class Attempt:
             particles=[x],
             _singular_values=setting.material != "series",
         )
-        if setting.axis not in self._ends:
+        key = setting.axis, setting.law
+        if key not in self._ends:
             simulator.set_contact("hard")
             simulator.rollout(self._demonstration[None], gradient=False)
-            self._ends[setting.axis] = simulator.state().x[0]
-        end, mass = self._ends[setting.axis], scene.particle_mass * scene.particle_count
+            self._ends[key] = simulator.state().x[0]
+        end, mass = self._ends[key], scene.particle_mass * scene.particle_count
         target = spread_mass(end, scene.grid_size, mass / len(end))
         simulator.set_target(target[None], target_sdf(target, 0.1 * scene.particle_mass)[None])
         actions, found = ACTION_SCALE * self._demonstration[None], {}
@@ -228,15 +236,20 @@ def errors_of(result: Result, exact: Result, grid: int, *, same_particles: bool)
 
 def rows(tasks: Sequence[str], plan: Plan, device: str) -> Iterator[dict[str, Any]]:
     """Run a plan; yield a row of :data:`COLUMNS` per task, setting and contact model."""
-    settings, references = plan.settings()
+    every, references = plan.settings()
     for task in tasks:
         attempt = Attempt(task, plan, device)
-        exact = {axis: attempt.run(setting, 0) for axis, setting in references.items()}
+        # Each law is compiled anew.
+        settings = [setting for setting in every if setting.axis != "law" or task == tasks[0]]
+        axes = {(setting.axis, setting.law) for setting in settings}
+        exact = {key: attempt.run(setting, 0) for key, setting in references.items() if key in axes}
         for setting in settings:
-            same = setting.axis == "substeps"
+            same = setting.axis != "grid"
             for contact, result in attempt.run(setting, plan.repeats).items():
                 nodes = plan.grid if same else plan.grids[0]
-                errors = errors_of(result, exact[setting.axis][contact], nodes, same_particles=same)
+                errors = errors_of(
+                    result, exact[setting.axis, setting.law][contact], nodes, same_particles=same
+                )
                 yield {
                     **setting._asdict(),
                     "task": task,

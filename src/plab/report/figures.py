@@ -305,14 +305,14 @@ _MARKS = {"series": "o", "singular values": "s"}
 
 
 def diagrams(table: pd.DataFrame) -> list[Drawing]:
-    """Plot run time against each kind of error, with one figure per task and varied quantity, and one panel
+    """Plot run time against each kind of error, with one figure per task and varied number, and one panel
     per contact model and kind.
 
     Args:
         table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.read_benchmark`.
     """
     notes = ["Error against a much finer reference in float64; x above: diverged.", *origin(table)]
-    table = table.astype(dict.fromkeys(("ms_per_step", *_ERRORS), float))
+    table = table[table["axis"] != "law"].astype(dict.fromkeys(("ms_per_step", *_ERRORS), float))
     out = []
     for (varied, task), own in table.groupby(["axis", "task"], sort=False):
         contacts = list(dict.fromkeys(own["contact"]))
