@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from plab.config.families import RL
 from plab.config.selection import lookup
@@ -324,6 +325,12 @@ def diagrams(table: pd.DataFrame) -> list[Drawing]:
             _errors(panel, shown, column, str(varied))
             panel.set_title(f"{task}, {contact} contact", pad=12)
             panel.set(xscale="log", yscale="log", xlabel="ms per step with gradient", ylabel=_ERRORS[column])
+            for axis in (panel.xaxis, panel.yaxis):
+                low, high = axis.get_view_interval()
+                narrow, wide = MaxNLocator(5, steps=(1, 2, 5, 10)), LogLocator(subs=(1, 2, 5))
+                axis.set_major_locator(narrow if high < 5.0 * low else wide)
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_formatter(NullFormatter())
         legend(figure)
         out.append(Drawing(f"{task}_{varied}", figure, [f"Numbers: {named}.", *notes]))
     return out
