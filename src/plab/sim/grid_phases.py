@@ -272,7 +272,7 @@ class GridPhases(Storage):
                     v = self.after_manipulators(e, s, x, free, near, m)
                     frame = ti.Vector.zero(self.real, ti.static(self.frame_numbers(shape)))
                     out, touches = self.contact_adjoint(shape, grid_index, e, s, m, x, v, out, frame)
-                    if touches:
+                    if touches and ti.static(self.moves(shape)):
                         for k in ti.static(range(self.frame_numbers(shape))):
                             self.accumulate_frame(grid_index, m, k, frame[k])
         return out
