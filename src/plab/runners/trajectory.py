@@ -9,6 +9,7 @@ own environment in a shared simulator; its numbers do not depend on the other ru
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -18,6 +19,9 @@ import numpy as np
 from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule, family
 from plab.runners.runner import Runner, Step, Track, measures
+
+HALVINGS = 5
+"""Largest number of times that an iteration which diverges is repeated with half of the last update."""
 
 CHECK_INTERVAL = 10
 """Interval at which the best actions since the last check are evaluated in the hard contact model
@@ -60,7 +64,8 @@ class TrajectoryConfig(MethodConfig):
 class TrajectoryRunner(Runner):
     """Runner of one action sequence per run; each iteration is one joint rollout with gradient.
 
-    If loss, gradient or state of a run diverge, the run fails, and the others continue.
+    If loss, gradient or state of a run diverge, the iteration is repeated with half of the last update, up to
+    :data:`HALVINGS` times; then the run fails, and the others continue.
     """
 
     def build(self) -> None:
@@ -69,6 +74,8 @@ class TrajectoryRunner(Runner):
         self._set_contact()
         self._rules: dict[int, UpdateRule] = {}
         self._finalists: dict[int, Finalists] = {}
+        # Actions of the last iteration.
+        self._before: dict[int, np.ndarray] = {}
 
     def _set_contact(self) -> None:
         methods = [track.cfg.method_as(TrajectoryConfig) for track in self.tracks]
@@ -85,6 +92,7 @@ class TrajectoryRunner(Runner):
             rule.actions = np.array(state["actions"])
             rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
             self._finalists[track.number] = Finalists.of(state["finalists"])
+            self._before[track.number] = np.array(state["before"])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Simulate the actions of all runs, and update each run's actions by their gradient."""
@@ -92,6 +100,15 @@ class TrajectoryRunner(Runner):
         for track in tracks:
             tried[track.number] = self._rules[track.number].actions
         episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
+        repeated, known = Counter[int](), self._before.keys() & {track.number for track in tracks}
+        for _ in range(HALVINGS):
+            if not (broken := episodes.failures.keys() & known):
+                break
+            for number in broken:
+                rule = self._rules[number]
+                rule.actions = tried[number] = 0.5 * (rule.actions + self._before[number])
+            repeated.update(broken)
+            episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
         rows: dict[Track, dict[str, float]] = {}
         for track in tracks:
             number = track.number
@@ -99,6 +116,7 @@ class TrajectoryRunner(Runner):
                 track.fail(episodes.failures[number])
                 continue
             gradient = cast(np.ndarray, episodes.gradient)[number]
+            self._before[number] = tried[number]
             self._rules[number].step(gradient)
             rows[track] = row = measures(episodes, number)
             row["gradient_norm"] = float(np.linalg.norm(gradient))
@@ -117,9 +135,10 @@ class TrajectoryRunner(Runner):
             step = Step(
                 row | {"kept_score": finalists.kept_score},
                 tried[track.number],
-                {"actions": rule.actions, "optimizer": dict(rule.state), "finalists": finalists.state()},
+                {"actions": rule.actions, "before": tried[track.number], "optimizer": dict(rule.state)}
+                | {"finalists": finalists.state()},
                 steps_forward=checks.get(track, 0) * len(rule.actions),
-                steps_gradient=len(rule.actions),
+                steps_gradient=(1 + repeated[track.number]) * len(rule.actions),
                 # Before the first check, the actions with the lowest loss are kept.
                 whole=np.isnan(finalists.kept_score) or track not in judging,
                 best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
