@@ -88,23 +88,32 @@ def test_a_run_that_breaks_off_does_not_disturb_the_others(tmp_path: Path, alone
 
 
 def test_an_iteration_that_diverges_is_repeated_with_half_of_the_update(tmp_path: Path, alone) -> None:
-    """Let environment 1 diverge once, in the third iteration."""
-    cfgs = configs(tmp_path)
-    intact, tried = Problem.rollout, list[np.ndarray]()
+    """Let environment 1 diverge once, in the third iteration; also if the runs are resumed just before."""
+    intact, results = Problem.rollout, list[RunResult]()
+    for whole in (True, False):
+        cfgs, tried = configs(tmp_path / str(whole)), list[np.ndarray]()
 
-    def rollout(self, actions, **options):
-        tried.append(np.array(actions[1]))
-        episodes = intact(self, actions, **options)
-        return replace(episodes, failures={1: "gone"}) if len(tried) == 3 else episodes
+        def rollout(self, actions, tried=tried, **options):
+            tried.append(np.array(actions[1]))
+            episodes = intact(self, actions, **options)
+            return replace(episodes, failures={1: "gone"}) if len(tried) == 3 else episodes
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Problem, "rollout", rollout)
-        ended = run_batch(cfgs, cache=CACHE)
-    assert [one.status for one in ended] == ["finished"] * 4
-    np.testing.assert_array_equal(tried[3], 0.5 * (tried[2] + tried[1]))
-    for k in (0, 2, 3):
-        finished_as(cfgs[k], alone[k])
-    own, other = read(cfgs[1].path).iterations, alone[1].iterations
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Problem, "rollout", rollout)
+            if not whole:
+                with stopped_at(8):
+                    run_batch(cfgs, cache=CACHE)
+                # The interrupted iteration will be repeated.
+                assert [read(cfg.path.with_suffix(".partial.h5")).rows for cfg in cfgs] == [2] * 4
+                del tried[2:]
+            ended = run_batch(cfgs, cache=CACHE)
+        assert [one.status for one in ended] == ["finished"] * 4
+        np.testing.assert_array_equal(tried[3], 0.5 * (tried[2] + tried[1]))
+        for k in (0, 2, 3):
+            finished_as(cfgs[k], alone[k])
+        results.append(read(cfgs[1].path))
+    finished_as(cfgs[1], results[0])
+    own, other = results[0].iterations, alone[1].iterations
     equal = own["loss"].to_numpy() == other["loss"].to_numpy()
     assert equal[:2].all() and not equal[2:].any()
     assert own["steps_gradient"].diff().tolist()[1:3] == [cfgs[1].sim.horizon, 2 * cfgs[1].sim.horizon]

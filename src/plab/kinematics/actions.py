@@ -28,8 +28,8 @@ class LinkMotion:
     """Motion of the links in some environment steps, with its pullback.
 
     Attributes:
-        twists: Actions of the simulator, shape [T, batch, component]; a CUDA tensor, an array if they were
-            computed on the CPU from an array, or a tensor.
+        twists: Actions of the simulator, shape [T, batch, component]: an array if computed on the CPU from an
+            array, otherwise a tensor.
         joints: Joint positions after the last step, shape [batch, joint], likewise.
     """
 
@@ -63,7 +63,7 @@ class JointActions:
     def __init__(self, scenes: Sequence[Scene], device: str = "cpu") -> None:
         """Initialise with the chains of the scenes; components of other manipulators come first. Actions in
         arrays are converted on ``device``, ``cpu`` or ``cuda``, if PyTorch has it."""
-        self._device = device if torch.cuda.is_available() else "cpu"
+        self._device = "cuda" if device == "cuda" and torch.cuda.is_available() else "cpu"
         chains: list[Chain] = [scene.kinematics for scene in scenes]  # type: ignore[misc]
         first = chains[0]
         self._direct = scenes[0].action_dim - len(first.components)

@@ -157,11 +157,13 @@ def kernel_actions(
         return numbers
     # Another stream might reuse a tensor's memory before the kernels have read it.
     array = ti.ndarray(ti.f64, shape=max(1, count))
-    if stays and not _in_default_stream():
+    elsewhere = stays and not _in_default_stream()
+    if elsewhere:
+        # Wait for the actions of the manipulators.
         sys.modules["torch"].cuda.current_stream().synchronize()
     if count:
         copy_numbers(array, 0, numbers, count, True)
-    if stays and not _in_default_stream():
+    if elsewhere:
         ti.sync()
     return array
 
