@@ -13,7 +13,7 @@ import pytest
 import laws
 from pages import ROOT, blocks
 from plab.config import ConfigError, build_scene, load_config
-from plab.laws import Law
+from plab.laws import Law, viscoplastic
 from plab.laws.algebra import Series
 from plab.scenes import LAWS, Body, Material, Scene, find_law
 from plab.sim import DeviceError, Simulator
@@ -39,8 +39,8 @@ OWN = {"von_mises": {"yield_stress": 20.0}, "viscoplastic": {"yield_stress": 20.
 COUNT = 600
 
 
-def coefficients(law: Law) -> list[float]:
-    return law.coefficients_of({**law.defaults, **OWN.get(law.name, {})})
+def coefficients(law: Law, **values: float) -> list[float]:
+    return law.coefficients_of({**law.defaults, **OWN.get(law.name, {}), **values})
 
 
 def deformed(strain: float) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +82,8 @@ def test_shear_follows_closed_forms() -> None:
     np.testing.assert_allclose(tau[[0, 1, 3]], [mu * 0.01, 0.0, mu * 0.1], atol=1e-9)
     assert sheared(LAWS["fluid"], [5000.0, 2.0], 10.0, 5)[3] == pytest.approx(20.0)
     for exponent in (1.0, 0.5):
-        tau = sheared(LAWS["viscoplastic"], [mu, lam, 20.0, 3.0, exponent], 10.0, 3000)
+        own = coefficients(LAWS["viscoplastic"], yield_stress=20.0, consistency=3.0, exponent=exponent)
+        tau = sheared(LAWS["viscoplastic"], own, 10.0, 3000)
         assert tau[3] == pytest.approx(20.0 / math.sqrt(2.0) + 3.0 * 10.0**exponent, rel=2e-3)
     sand = LAWS["drucker_prager"]
     own = sand.coefficients_of(sand.defaults)
@@ -124,8 +125,8 @@ def principal_stress(law: str, strain: np.ndarray, own: list[float]) -> np.ndarr
     pressure = (lam + 2.0 * mu / 3.0) * trace
     if law == "drucker_prager":
         return 2.0 * mu * min(1.0, -1.5 * more[0] * pressure / mu / norm) * deviator + pressure
-    over = 2.0 * mu * norm - more[0]
-    carried = more[0] + over / (1.0 + mu * DT / more[1]) if over > 0.0 else 2.0 * mu * norm
+    over, consistency = 2.0 * mu * norm - more[0], math.exp(more[1]) / math.sqrt(2.0)
+    carried = more[0] + over / (1.0 + mu * DT / consistency) if over > 0.0 else 2.0 * mu * norm
     return carried * deviator / norm + pressure
 
 
@@ -380,6 +381,15 @@ def test_laws_are_found_by_name() -> None:
         Material(5000.0, 0.2, 50.0, "elastic", (("friction", 1.0),)).validate()
     with pytest.raises(ValueError, match=r"friction_angle 95 is outside \[0, 90\)"):
         Material(5000.0, 0.2, 50.0, "drucker_prager", (("friction_angle", 95.0),)).validate()
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 5.0])
+def test_overstress_solves_its_equation(power: float) -> None:
+    trial, root = np.geomspace(1e-6, 1e6, 500)[:, None], math.sqrt(2.0)
+    consistency = np.geomspace(1e-4, 1e4, 9)
+    x = viscoplastic.overstress(trial, DT, 2000.0, np.log(root * consistency), power)
+    flow = root * 2000.0 * DT * (x / (root * consistency)) ** power
+    np.testing.assert_allclose(x + flow, np.broadcast_to(trial, x.shape), rtol=1e-12)
 
 
 def test_the_page_on_laws_shows_its_example_and_what_it_prints(capsys) -> None:

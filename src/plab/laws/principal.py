@@ -12,8 +12,8 @@ from plab.laws.algebra import SYM, mat_from_sym, total
 from plab.laws.tracing import Node, derivatives, frozen
 
 SWEEPS = 5
-"""Sweeps over the three pairs of axes; four reach rounding in float32, five in float64; singular values take
-one more."""
+"""Sweeps over the three pairs of axes to rounding in float64, one less in float32; singular values take one
+more."""
 
 TINY = 1e-30
 """Regularisation, so that the tangent of a rotation is 0 for diagonal tensors."""
@@ -40,7 +40,7 @@ class PrincipalFrame:
         s = [frozen(x) for x in b]
         zero = 0.0 * s[0]
         q = [[zero + 1.0, zero, zero], [zero, zero + 1.0, zero], [zero, zero, zero + 1.0]]
-        for _ in range(SWEEPS):
+        for _ in range(SWEEPS - getattr(b[0], "single", False)):
             for i, j in _OFF:
                 k = 3 - i - j
                 off = s[_OFF[i, j]]

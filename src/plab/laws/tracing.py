@@ -42,6 +42,11 @@ class Node:
     ) -> None:
         self.trace, self.place, self.operation, self.arguments = trace, place, operation, arguments
 
+    @property
+    def single(self) -> bool:
+        """Whether values have single precision."""
+        return self.trace.single
+
     def __add__(self, other: Number) -> Number:
         return self.trace.sum(self, other)
 
@@ -115,9 +120,10 @@ def frozen(number: Number) -> Number:
 
 
 class Trace:
-    """A record of operations, in topological order."""
+    """A record of operations on numbers of single or double precision, in topological order."""
 
-    def __init__(self) -> None:
+    def __init__(self, single: bool = False) -> None:
+        self.single = single
         self.nodes: list[Node] = []
         self._known: dict[tuple[Any, ...], Node] = {}
 

@@ -13,53 +13,56 @@ from plab.laws.drucker_prager import NORM_SHIFT, hencky
 from plab.laws.elastic import ELASTIC, lame
 from plab.laws.law import Law, Parameter
 from plab.laws.principal import PrincipalFrame
-from plab.laws.tracing import frozen
+from plab.laws.tracing import Node, frozen
 
-NEWTON_STEPS = 6
-
-FLOW_MIN = 1e-30
+HALLEY_STEPS = 3
+"""Steps to rounding in float64, for all exponents and rates."""
 
 LEAST = 1e-12
-"""Lower bound of the relative overstress before it is raised to a power."""
+"""Lower bound of the overstress before its logarithm [Pa]."""
 
 
-def update(c, f, dt, mu, lam, yield_stress, consistency, exponent):
+def update(c, f, dt, mu, lam, yield_stress, log_consistency, power):
     """Return the Kirchhoff stress, and F after the substep."""
     g = trial_gradient(c, f, dt)
     frame = PrincipalFrame(outer_sym(g))
     trace, deviator = hencky(frame)
     norm = np.sqrt(total(e * e for e in deviator) + NORM_SHIFT)
     over = np.maximum(2.0 * mu * norm - yield_stress, 0.0)
-    k = 1.0 - (over - overstress(over, dt, mu, consistency, 1.0 / exponent)) / (2.0 * mu * norm)
+    k = 1.0 - (over - overstress(over, dt, mu, log_consistency, power)) / (2.0 * mu * norm)
     pressure = (lam + (2.0 / 3.0) * mu) * trace
     tau = frame.tensor([2.0 * mu * (k * e) + pressure for e in deviator], (trace, k))
     flow = frame.tensor([np.exp((k - 1.0) * e) for e in deviator], (trace, k))
     return tau, mul_sym_mat(flow, g)
 
 
-def overstress(trial, dt, mu, consistency, power):
+def overstress(trial, dt, mu, log_consistency, power):
     """Overstress x after the substep, given the trial overstress.
 
-    It solves x + sqrt(2) mu dt (x / (sqrt(2) consistency))^power = trial, by Newton's method in x / trial.
-    The derivative is taken at the last step.
+    It solves x + sqrt(2) mu dt (x / (sqrt(2) consistency))^power = trial by Halley's method in x / trial,
+    with powers from logarithms.
     """
-    scale = np.maximum(trial, LEAST)
-    ratio = scale / (math.sqrt(2.0) * consistency)
-    flow = math.sqrt(2.0) * mu * dt * np.exp(power * np.log(ratio)) / scale
+    log_trial = np.log(np.maximum(trial, LEAST))
+    log_flow = np.log(math.sqrt(2.0) * mu * dt) - log_trial + power * (log_trial - log_consistency)
+    flow, p = frozen(log_flow), frozen(power)
     # An upper bound of the solution, at which both terms are at most 1.
-    x = np.exp(np.minimum(np.log(np.maximum(frozen(flow), FLOW_MIN)) * (-1.0 / frozen(power)), 0.0))
-    for step in range(NEWTON_STEPS):
-        last = step == NEWTON_STEPS - 1
-        b, p = (flow, power) if last else (frozen(flow), frozen(power))
-        x = np.maximum(frozen(x), LEAST)
-        raised = b * np.exp(p * np.log(x))
-        x = x - (x + raised - 1.0) / (1.0 + frozen(p * raised / x))
+    log_x = np.minimum(-flow / p, 0.0)
+    x, raised = np.exp(log_x), np.exp(np.minimum(flow, 0.0))
+    for _ in range(HALLEY_STEPS):
+        rest, slope = x + raised - 1.0, x + p * raised
+        change = 1.0 - rest * slope / (slope * slope - 0.5 * rest * (p * (p - 1.0) * raised))
+        x, log_x = x * change, log_x + np.log(change)
+        raised = np.exp(p * log_x + flow)
+    if isinstance(trial, Node):
+        # Zero, with the derivative of the solution.
+        x = x - frozen(x * raised / (x + p * raised)) * (log_flow - flow + frozen(log_x) * (power - p))
     return trial * x
 
 
 def coefficients(youngs_modulus, poisson_ratio, yield_stress, consistency, exponent):
-    """Lame's parameters, and the other parameters unchanged."""
-    return *lame(youngs_modulus, poisson_ratio), yield_stress, consistency, exponent
+    """Lame's parameters, the yield stress, the logarithm of sqrt(2) consistency, and 1 / exponent."""
+    log_consistency = np.log(math.sqrt(2.0) * consistency)
+    return *lame(youngs_modulus, poisson_ratio), yield_stress, log_consistency, 1.0 / exponent
 
 
 VISCOPLASTIC = Law(

@@ -340,7 +340,7 @@ class Number:
     """A vector of lanes or one number; each operator emits an instruction."""
 
     def __init__(self, code: Code, value: ir.Value) -> None:
-        self.code, self.value = code, value
+        self.code, self.value, self.single = code, value, code.single
 
     def _operation(self, name: str, *given: Number | float) -> Number:
         values = [one.value if isinstance(one, Number) else self.code.constant(one) for one in given]

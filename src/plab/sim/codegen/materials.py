@@ -58,7 +58,7 @@ def pulled_back(
         bars: Adjoints of the results.
         known: Values of the intermediate results.
     """
-    trace = Trace()
+    trace = Trace(getattr(given[0], "single", False))
     inputs, others = trace.inputs("given", len(given)), trace.inputs("fixed", len(fixed))
     own = trace.inputs("bars", len(bars))
     results, intermediate = function(inputs, others)
