@@ -105,17 +105,26 @@ def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path)
 
 
 @pytest.mark.nightly
-def test_parameters_are_found_from_observed_particles(tmp_path: Path) -> None:
+@pytest.mark.parametrize("observation", ["particles", "depth"])
+def test_parameters_are_found_from_observations(tmp_path: Path, observation: str) -> None:
     words = ["task=Torus", "variant=1", *COARSE, "observe_particles=30"]
-    assert main([*words, "--output", str(tmp_path)]) == 0
+    places = {"front": [0.5, 0.7, 1.3], "side": [1.3, 0.7, 0.5]}
+    cameras = {
+        name: {"position": at, "target": [0.5, 0.1, 0.5], "size": [128, 128]} for name, at in places.items()
+    }
+    (tmp_path / "cameras.yaml").write_text(json.dumps(cameras))
+    looks = ["--cameras", f"{tmp_path}/cameras.yaml"] if observation == "depth" else []
+    assert main([*words, "--output", str(tmp_path), "--observe", observation, *looks]) == 0
     fit = ["method=identify", f"method.dataset={tmp_path}/plab/Torus-v0", "task.yield_stress=100"]
+    fit += [f"method.observation={observation}"]
     fit += ["method.parameters=[yield_stress,gravity]", "method.iterations=8", "checkpoint_seconds=0"]
     cfg, again = (load_config([*words, *fit, f"results_dir={tmp_path}/{name}"]) for name in "ab")
     result = run(cfg)
     rows, last = result.iterations, result.iterations.iloc[-1]
     assert last["yield_stress"] == pytest.approx(50.0, rel=0.1)
     assert last["gravity"] == pytest.approx(30.0, rel=0.1)
-    assert rows["misfit"].is_monotonic_decreasing and last["misfit"] < 0.1 * rows["misfit"][0]
+    part = 0.1 if observation == "particles" else 0.5
+    assert rows["misfit"].is_monotonic_decreasing and last["misfit"] < part * rows["misfit"][0]
     assert 0.0 < last["yield_stress_deviation"] < 5.0 and np.isnan(last["youngs_modulus"])
     with stopped_at(3):
         run_config(again, CACHE)

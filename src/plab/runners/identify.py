@@ -1,6 +1,6 @@
-"""System identification (``identify``): a fit of material, friction and gravity to observed particles.
+"""System identification (``identify``): a fit of material, friction and gravity to particles or depth images.
 
-Gauss-Newton method with Levenberg's damping on the particle positions of an episode of a dataset. Derivatives
+Gauss-Newton method with Levenberg's damping on the observations of an episode of a dataset. Derivatives
 are central differences, with all simulations in one batch. The standard deviations are from Laplace's
 approximation, with the noise estimated from the residuals. The configuration provides the initial guess. To
 reproduce a result:
@@ -11,6 +11,9 @@ reproduce a result:
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -23,7 +26,7 @@ from plab.runners.runner import Runner, Step, Track, shared_problem
 
 if TYPE_CHECKING:
     from plab.problem import Episodes
-    from plab.scenes import Scene
+    from plab.scenes import Camera, Scene
 
 PARAMETERS = (
     *("youngs_modulus", "poisson_ratio", "yield_stress"),
@@ -35,13 +38,17 @@ only on the ratios of moduli and yield stress to it."""
 
 HIGHEST_POISSON_RATIO = 0.49
 
+BLOCKS = 16
+"""Blocks of pixels along the height of an image: mean depths are linear in the motion of a silhouette."""
+
 
 @dataclass
 class IdentifyConfig(MethodConfig):
     """System identification.
 
     Attributes:
-        dataset: Folder of a dataset of this task and variant; the observation is ``state`` or ``particles``.
+        dataset: Folder of a dataset of this task and variant.
+        observation: ``particles`` (from ``state`` or ``particles``), or ``depth``, images of its cameras.
         episode: Number of the fitted episode.
         parameters: Fitted parameters, from :data:`PARAMETERS`; the others are the task's.
         iterations: Number of Gauss-Newton steps.
@@ -50,6 +57,7 @@ class IdentifyConfig(MethodConfig):
     """
 
     dataset: str
+    observation: str
     episode: int = field(metadata=ranges.NOT_NEGATIVE)
     parameters: list[str]
     iterations: int = field(metadata=ranges.COUNT)
@@ -58,6 +66,7 @@ class IdentifyConfig(MethodConfig):
 
     def check(self, path: str) -> None:
         super().check(path)
+        ranges.one_of(f"{path}.observation", self.observation, ("particles", "depth"))
         if not self.parameters or len(set(self.parameters)) < len(self.parameters):
             raise ConfigError(f"{path}.parameters must name each parameter once (got {self.parameters})")
         for name in self.parameters:
@@ -68,8 +77,9 @@ class IdentifyRunner(Runner):
     """Runner of system identification; each iteration is a batch of simulations, and a step if the trial
     improved the fit.
 
-    A row has the best parameters so far, their standard deviations, and the RMS distance of the particles
-    from their observed positions. Actions and scores are those of the episode.
+    A row has the best parameters so far, their standard deviations, and the misfit: the RMS distance of the
+    particles from their observed positions, or the RMS difference of the mean depths of blocks of pixels.
+    Actions and scores are those of the episode.
     """
 
     def build(self) -> None:
@@ -82,18 +92,49 @@ class IdentifyRunner(Runner):
         if (count := len(episodes)) <= method.episode:
             raise ConfigError(f"method.episode={method.episode}: {method.dataset} has {count} episodes")
         self._actions = episodes[-1].actions.astype(np.float64)
-        seen: Any = episodes[-1].observations
-        if isinstance(seen, dict):
-            seen = seen.get("particles", seen.get("state", np.empty((0, 0))))
-        least = track.cfg.observe_particles if seen.ndim == 2 else scene.particle_count
-        self._stride = max(scene.particle_count // least, 1)
-        count = len(range(0, scene.particle_count, self._stride))
         shape, wanted = self._actions.shape, (scene.horizon, scene.action_dim)
-        if shape != wanted or seen.reshape(len(seen), -1).shape[1] < 3 * count:
-            why = "has another scene or observation: use its task, sim and observe_particles"
+        read = self._read_depth if method.observation == "depth" else self._read_particles
+        observed = read(episodes[-1].observations) if shape == wanted else None
+        if observed is None:
+            why = "has another scene or observation: use its task, sim, observe_particles and observation"
             raise ConfigError(f"method.dataset={method.dataset} {why}")
-        rows = seen if seen.ndim == 3 else seen[:, : 6 * count].reshape(len(seen), count, 6)
-        self._observed = rows[1:, :, :3].astype(np.float64)
+        self._observed = observed.astype(np.float64)
+
+    def _read_particles(self, seen: Any) -> np.ndarray | None:
+        """Return the positions after each step, shape [T, particle, 3]; None if they do not fit the scene."""
+        simulator = self.problem.simulator
+        none = np.empty((0, 0))
+        table: Any = seen.get("particles", seen.get("state", none)) if isinstance(seen, dict) else seen
+        least = self.tracks[0].cfg.observe_particles if table.ndim == 2 else simulator.particle_count
+        stride = max(simulator.particle_count // least, 1)
+        count = len(range(0, simulator.particle_count, stride))
+        if table.ndim > 3 or table.reshape(len(table), -1).shape[1] < 3 * count:
+            return None
+        self._look = lambda: np.asarray(simulator.observe(stride))[..., :3]
+        rows = table if table.ndim == 3 else table[:, : 6 * count].reshape(len(table), count, 6)
+        return np.asarray(rows[1:, :, :3])
+
+    def _read_depth(self, seen: Any) -> np.ndarray | None:
+        """Return the mean depths of blocks after each step, shape [T, block]; None without these images."""
+        from gymnasium.spaces import Box
+
+        from plab.demonstrations.minari import metadata_of
+        from plab.envs.observations import Sensors
+
+        environment = json.loads(metadata_of(self.method.dataset).get("env_spec", "{}"))
+        given = environment.get("kwargs", {}).get("cameras") or self.tracks[0].cfg.task.cameras or None
+        sensors = Sensors(["depth"], given, self.problem.simulator, Box(0.0, 1.0, (1,)), 1)
+        names = {f"{name}_depth": camera for name, camera in sensors.cameras.items()}
+        if not isinstance(seen, dict):
+            seen = dict.fromkeys(names, seen) if len(names) == 1 else {}
+        if any(name not in seen for name in names):
+            return None
+
+        def depths(pictures: Any) -> np.ndarray:
+            return np.concatenate([_block_depths(pictures[name], one) for name, one in names.items()], -1)
+
+        self._look = lambda: depths(sensors(lambda: None, self._actions))
+        return depths(seen)[1:]
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Start from the configuration's parameters, or resume from the file."""
@@ -112,11 +153,11 @@ class IdentifyRunner(Runner):
         method, state = self.method, self._state
         changes = np.eye(len(method.parameters)) * method.difference
         trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
-        positions, measured = self._simulate(np.exp(trials))
-        residual = (positions[0] - self._observed).ravel()
+        seen, measured = self._simulate(np.exp(trials))
+        residual = (seen[0] - self._observed).ravel()
         cost = float(residual @ residual)
         if cost < state["cost"]:
-            up, down = np.split(positions[1:].reshape(2 * len(changes), -1), 2)
+            up, down = np.split(seen[1:].reshape(2 * len(changes), -1), 2)
             slopes = (up - down) / (2.0 * method.difference)
             linear = {"curvature": slopes @ slopes.T, "slope": slopes @ residual}
             state |= {"best": state["trial"], "cost": cost, "damping": state["damping"] / 3.0} | linear
@@ -131,7 +172,8 @@ class IdentifyRunner(Runner):
         # Parameters without effect, such as floor friction while bodies stick.
         deviations[np.diag(state["curvature"]) == 0.0] = np.nan
         found = dict.fromkeys(FAMILY.columns, np.nan)
-        found["misfit"] = float(np.sqrt(3.0 * state["cost"] / residual.size))
+        each = 1 if method.observation == "depth" else 3
+        found["misfit"] = float(np.sqrt(each * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
             found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
         steps = len(self._actions) * len(trials)
@@ -152,20 +194,31 @@ class IdentifyRunner(Runner):
         return f"misfit {means['misfit']:.3g}, {', '.join(fit)}"
 
     def _simulate(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
-        """Return positions after each step, shape [environment, T, particle, 3], with parameters of shape
+        """Return what is observed after each step, shape [environment, T, ...], with parameters of shape
         [environment, parameter], and the measures of the first episode."""
         problem, simulator = self.problem, self.problem.simulator
         scene = problem.scenes[0]
         simulator.set_scenes([_changed(scene, self.method.parameters, own) for own in values])
         simulator.set_contact("hard")
-        first, terms, positions = problem.loss_of(simulator.measure().terms)[0], [], []
+        first, terms, seen = problem.loss_of(simulator.measure().terms)[0], [], []
         for action in self._actions:
             simulator.step(np.stack([action] * simulator.batch))
-            positions.append(np.asarray(simulator.observe(self._stride))[..., :3])
+            seen.append(self._look())
             terms.append(simulator.measure().terms[0])
         table = np.array(terms)
         measured = problem.totals(table, problem.loss_of(table), first, simulator.measure().iou)
-        return np.stack(positions, axis=1).astype(np.float64), measured
+        return np.stack(seen, axis=1).astype(np.float64), measured
+
+
+def _block_depths(pictures: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return mean depths of blocks of pixels, shape [..., block], from images of shape [..., height, width,
+    1]; the background is as far as the farthest corner of the domain."""
+    farthest = max(math.dist(camera.position, corner) for corner in itertools.product((0.0, 1.0), repeat=3))
+    *first, height, width, _ = pictures.shape
+    edge = max(height // BLOCKS, 1)
+    rows, columns = height // edge, width // edge
+    kept = pictures[..., : rows * edge, : columns * edge, 0].clip(max=farthest)
+    return kept.reshape(*first, rows, edge, columns, edge).mean((-3, -1)).reshape(*first, -1)
 
 
 def _value(scene: Scene, name: str) -> float:
@@ -187,7 +240,7 @@ def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
 
 
 FAMILY = Family(
-    label="scene parameters fitted to observed particles",
+    label="scene parameters fitted to observed particles or depth images",
     config=IdentifyConfig,
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
