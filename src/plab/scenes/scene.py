@@ -241,9 +241,11 @@ class ManipulatorShape:
 
     Attributes:
         size_names: Names of the entries of :attr:`Manipulator.size`, in order; all lengths [domain units].
-        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation),
-            ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
-        action_names: Name of each action component, in order. Each is clipped to [-1, 1].
+        motion: Motion rule of :func:`plab.sim.motion.advance_pose`: ``translate``, ``roll``, ``grip``,
+            ``rigid`` (translation and world rotation), ``twist`` (the same, neither scaled nor clipped nor
+            bounded) or ``static``.
+        action_names: Name of each action component, in order. Each is clipped to [-1, 1]. ``x``, ``y``,
+            ``z``, ``vertical`` and ``close`` (of the gap) are lengths, all others angles.
         outline: Shape with the same surface; default: this shape.
         support: Distance from the position to the farthest point along directions, as a function of the
             sizes and unit vectors in the manipulator's frame, shape [3] or [3, number]; None for shapes that
@@ -259,12 +261,12 @@ class ManipulatorShape:
     @property
     def moves(self) -> bool:
         """True if actions move the manipulator."""
-        return self.motion != "static"
+        return bool(self.action_names)
 
     @property
     def turns(self) -> bool:
         """True if the rotation depends on the actions."""
-        return self.motion in ("roll", "grip", "rigid", "twist")
+        return any(name not in (*_LENGTHS, "close") for name in self.action_names)
 
     @property
     def scaled(self) -> bool:
@@ -274,10 +276,11 @@ class ManipulatorShape:
     @property
     def grips(self) -> bool:
         """True if the gap depends on the actions."""
-        return self.motion == "grip"
+        return "close" in self.action_names
 
 
 _XYZ = ("x", "y", "z")
+_LENGTHS = (*_XYZ, "vertical")
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 
 
@@ -371,15 +374,14 @@ class Manipulator:
     def largest_step(self) -> float:
         """Upper bound of the displacement of any point of the manipulator in an environment step [domain
         units]; 0 for links, whose motion is bounded by their model."""
-        motion, scale = self.kind.motion, np.abs(self.scale)
-        reach = sum(self.size) + self.gap
-        if motion in ("static", "twist"):
+        if not self.kind.scaled:
             return 0.0
-        if motion == "roll":
-            roll, yaw, vertical = scale
-            return float(roll * (ROLL_RADIUS + self.size[1]) + yaw * reach + vertical)
-        length = float(np.linalg.norm(scale[:3]) + np.linalg.norm(scale[3:6]) * reach)
-        return length + 0.5 * float(scale[6]) if motion == "grip" else length
+        # Separate bounds for the roll, during which the axis moves, too, and for half of the gap.
+        scale = dict(zip(self.kind.action_names, np.abs(self.scale).tolist(), strict=True))
+        out = scale.pop("roll", 0.0) * (ROLL_RADIUS + self.size[-1]) + 0.5 * scale.pop("close", 0.0)
+        lengths = [scale.pop(name) for name in _LENGTHS if name in scale]
+        angle = float(np.linalg.norm([*scale.values()]))
+        return out + float(np.linalg.norm(lengths)) + angle * (sum(self.size) + self.gap)
 
 
 @dataclass(frozen=True)
