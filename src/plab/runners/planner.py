@@ -255,7 +255,7 @@ class PlannerRunner(Runner):
 
     The simulator has as many environments per run as the smallest population, or fewer if memory is limited;
     larger populations are evaluated in parts. A run stops early once its score reaches 1, or if all of its
-    candidates diverge.
+    candidates diverge; the simulator is replaced by a smaller one when half of its runs have stopped.
     """
 
     def context(self) -> AbstractContextManager[Any]:
@@ -263,19 +263,27 @@ class PlannerRunner(Runner):
         return torch_settings(1)
 
     def build(self) -> None:
-        """Build the problem; environment e belongs to run e modulo the number of runs."""
+        """Build the problem of all runs."""
+        self._device = torch.device(self.tracks[0].cfg.sim.device)
+        self._planners: dict[int, Any] = {}
+        self._simulate(self.tracks)
+
+    def _simulate(self, tracks: Sequence[Track], width: int | None = None) -> None:
+        """Build the problem of some runs, with at most ``width`` environments each, by default the smallest
+        population; environment e belongs to run e modulo the number of runs."""
         from plab.problem import build_scenes
         from plab.sim.memory import batch_limit
 
-        cfgs = [track.cfg for track in self.tracks]
+        # Releases the memory of the simulator in use.
+        self.__dict__.pop("problem", None)
+        cfgs = [track.cfg for track in tracks]
         scene, sim = build_scenes(cfgs[:1])[0], cfgs[0].sim
-        fewest = min(_smallest_population(cfg.method) for cfg in cfgs)
+        wanted = width or min(_smallest_population(cfg.method) for cfg in cfgs)
         room = max(1, batch_limit(scene, sim.precision, sim.device, sim.memory_mb) // len(cfgs))
-        parts = -(-fewest // room)
-        self._width = -(-fewest // parts)
+        parts = -(-wanted // room)
+        self._width = -(-wanted // parts)
+        self._simulated = list(tracks)
         self.problem = shared_problem(self.cache, cfgs * self._width)
-        self._device = torch.device(sim.device)
-        self._planners: dict[int, Any] = {}
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Create the run's planner, or restore it from the file."""
@@ -291,6 +299,8 @@ class PlannerRunner(Runner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Make one iteration of the planners of all runs."""
+        if 2 * len(tracks) <= len(self._simulated):
+            self._simulate(tracks)
         walks = {t: self._planners[t.number].plan(self.random(t.cfg.seed, t.iteration)) for t in tracks}
         shown, spent = self.drive(walks)
         for track, (actions, measured) in shown.items():
@@ -325,6 +335,8 @@ class PlannerRunner(Runner):
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
+        if len(self._simulated) < len(self.tracks):
+            self._simulate(self.tracks, 1)
         return super().judge(np.concatenate([actions] * self._width))
 
     def random(self, *key: int) -> torch.Generator:
@@ -335,14 +347,15 @@ class PlannerRunner(Runner):
     def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
         """Evaluate equally many candidates per run; a run whose candidates all diverge fails."""
         first, width = next(iter(requests.values())), self._width
-        count, reasons = len(first.actions), dict[int, str]()
+        count, runs, reasons = len(first.actions), len(self._simulated), dict[int, str]()
+        places = {track: k for k, track in enumerate(self._simulated)}
         # Ordered by candidate and run; each batch fills all environments.
-        size = count + -count % width, len(self.tracks), *first.actions.shape[1:]
+        size = count + -count % width, runs, *first.actions.shape[1:]
         tried = torch.zeros(size, dtype=torch.float64, device=self._device)
-        softness = np.zeros(len(self.tracks))
+        softness = np.zeros(runs)
         for track, request in requests.items():
-            tried[:count, track.number] = request.actions
-            softness[track.number] = request.softness or 0.0
+            tried[:count, places[track]] = request.actions
+            softness[places[track]] = request.softness or 0.0
         models = np.where(softness > 0, "soft", "hard")
         self.problem.simulator.set_contact(list(models) * width, np.tile(softness, width).tolist())
         parts: dict[str, list[Tensor]] = defaultdict(list)
@@ -359,19 +372,19 @@ class PlannerRunner(Runner):
                 given |= trials.measures | {"final": trials.final_loss}
                 given |= {"gradient": trials.gradient} if first.gradient else {}
             broken[list(failures)] = True
-            reasons |= {e % len(self.tracks): text for e, text in failures.items()}
+            reasons |= {e % runs: text for e, text in failures.items()}
             for name, values in given.items():
                 parts[name].append(torch.as_tensor(values).reshape(*part.shape[:2], *values.shape[1:]))
         whole = {name: torch.cat(rows)[:count] for name, rows in parts.items()}
         answers = {}
         for track in requests:
-            own = {name: values[:, track.number] for name, values in whole.items()}
+            own = {name: values[:, places[track]] for name, values in whole.items()}
             broken, final, gradient = own.pop("broken"), own.pop("final"), own.pop("gradient", None)
             if gradient is not None:
                 gradient = gradient.masked_fill(broken[:, None, None], 0.0)
             answers[track] = Answer(own, final, gradient, broken)
             if bool(broken.all()):
-                track.fail(f"all {count} candidates diverged; {reasons[track.number]}")
+                track.fail(f"all {count} candidates diverged; {reasons[places[track]]}")
         return answers
 
 
