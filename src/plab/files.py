@@ -95,24 +95,18 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 # --------------------------------------------------------------------------------------------------- archives
 
 
-@contextmanager
-def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file for :func:`member_bytes`; with ``packed``, the zip file itself is compressed by xz.
+def unpacked_archive(path: Path) -> zipfile.ZipFile:
+    """Open a zip file compressed by xz for :func:`member_bytes`; the last one is kept open, in memory.
 
-    The last unpacked archive is kept in memory. Names of members never become paths.
+    Names of members never become paths.
 
     Raises:
         UnreadableError: If it exceeds a size limit.
-        ValueError: If it is not a zip file, or damaged.
+        ValueError: If it is not such a file, or damaged.
         OSError: If it cannot be opened.
     """
     found = regular_file(path)
-    content = _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino) if packed else b""
-    with io.BytesIO(content) if packed else path.open("rb") as file:
-        with _damage():
-            archive = zipfile.ZipFile(file)
-        with archive:
-            yield archive
+    return _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino)
 
 
 def read_members(path: Path, most: int = LARGEST) -> dict[str, bytes]:
@@ -123,7 +117,8 @@ def read_members(path: Path, most: int = LARGEST) -> dict[str, bytes]:
         ValueError: If it is not a zip file, or damaged.
         OSError: If it cannot be opened.
     """
-    with opened_zip(path) as archive:
+    regular_file(path)
+    with _damage(), zipfile.ZipFile(path) as archive:
         if sum(info.file_size for info in archive.infolist()) > most:
             raise UnreadableError(f"it would unpack to more than the {most / 1e6:.3g} MB allowed")
         return {name: member_bytes(archive, name) for name in archive.namelist()}
@@ -160,17 +155,17 @@ def _damage() -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=1)
-def _unpacked(path: Path, size: int, *_: int) -> bytes:
-    """Return the content of an xz file, cached by the other arguments, which identify its version."""
+def _unpacked(path: Path, size: int, *_: int) -> zipfile.ZipFile:
+    """Open a compressed zip file, cached by the other arguments, which identify its version."""
     most = min(LARGEST, max(_SMALL, _RATIO * size))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING_MEMORY)
     with _damage():
         content = unpacker.decompress(path.read_bytes(), most)
-    if not unpacker.eof and len(content) == most:
-        raise UnreadableError(f"it would unpack from {size} to more than {most} bytes, more than is allowed")
-    if not unpacker.eof or unpacker.unused_data:
-        raise ValueError("it is truncated, or followed by other data")
-    return content
+        if not unpacker.eof and len(content) == most:
+            raise UnreadableError(f"it would unpack to more than the {most} bytes allowed")
+        if not unpacker.eof or unpacker.unused_data:
+            raise ValueError("it is truncated, or followed by other data")
+        return zipfile.ZipFile(io.BytesIO(content))
 
 
 # ----------------------------------------------------------------------------------------------------- arrays

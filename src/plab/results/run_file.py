@@ -20,7 +20,7 @@ import numpy as np
 from plab.config.families import FAMILIES
 from plab.config.selection import lookup
 from plab.errors import PlabError
-from plab.files import LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
+from plab.files import LARGEST, UnreadableError, member_bytes, one_line, regular_file, unpacked_archive
 from plab.plugins import pandas as pd
 
 SCHEMA_VERSION = 2
@@ -317,34 +317,29 @@ def opened(path: Path) -> Iterator[h5py.File]:
         ResultsError: If it cannot be opened, or its reading fails inside the ``with`` block.
     """
     inside = split_archive(path)
-    if inside is None:
-        with explained(path):
+    with explained(path):
+        if inside is None:
             regular_file(path)
-            with h5py.File(path, "r") as file:
-                yield _of_this_version(file, path)
-        return
-    archive, member = inside
-    with opened_archive(archive) as members:
-        if member not in members.NameToInfo:
-            raise ResultsError(f"{archive} has no run {member}")
-        with opened_member(members, member, path) as file:
+            file = h5py.File(path, "r")
+        else:
+            file = h5py.File(h5py.h5f.open_file_image(_member(*inside)))
+        with file:
+            _require_version(file, path)
             yield file
 
 
-@contextmanager
-def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+def _member(archive: Path, name: str) -> bytes:
+    """Return a member of an archive; errors of the archive name only the archive."""
+    members = opened_archive(archive)
+    if name not in members.NameToInfo:
+        raise ResultsError(f"{archive} has no run {name}")
+    return member_bytes(members, name)
+
+
+def opened_archive(path: Path) -> zipfile.ZipFile:
     """Open an archive, converting all errors to ResultsError; see :mod:`plab.files`."""
-    with explained(path), opened_zip(path, packed=True) as members:
-        yield members
-
-
-@contextmanager
-def opened_member(archive: zipfile.ZipFile, member: str, path: Path) -> Iterator[h5py.File]:
-    """Open a run in an archive as :func:`opened` does; ``path`` is for messages."""
     with explained(path):
-        image = h5py.h5f.open_file_image(member_bytes(archive, member))
-        with h5py.File(image) as file:
-            yield _of_this_version(file, path)
+        return unpacked_archive(path)
 
 
 @contextmanager
@@ -354,17 +349,14 @@ def explained(path: Path) -> Iterator[None]:
         yield
     except ResultsError:
         raise
-    except FileNotFoundError as error:
-        raise ResultsError(f"{path} does not exist") from error
-    except PermissionError as error:
-        raise ResultsError(f"{path} cannot be opened ({error.strerror or error})") from error
-    except UnreadableError as error:
-        raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
+    except (FileNotFoundError, PermissionError, UnreadableError) as error:
+        why = getattr(error, "strerror", None) or one_line(error)
+        raise ResultsError(f"{path} cannot be read: {why}") from error
     except Exception as error:
         raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
 
 
-def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
+def _require_version(file: h5py.File, path: Path) -> None:
     if file.attrs.get("format") != "plab-run":
         raise ResultsError(f"{path} is not a plab result file")
     version = int(file.attrs["schema_version"])
@@ -375,7 +367,6 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
         )
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
-    return file
 
 
 def summary_of(file: h5py.File) -> dict[str, Any]:

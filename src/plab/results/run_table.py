@@ -40,7 +40,6 @@ from plab.results.run_file import (
     last_score,
     opened,
     opened_archive,
-    opened_member,
     replace_file,
     scores_last_iteration,
     split_archive,
@@ -173,16 +172,9 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
     Raises:
         ResultsError: If a run cannot be read.
     """
-    wanted = list(map(str, paths))
-    archives = dict.fromkeys(inside[0] for path in wanted if (inside := split_archive(Path(path))))
-    found: dict[str, dict[str, np.ndarray]] = {}
-    for archive in archives:
-        # An archive is unpacked once for all of its runs.
-        for entry in read_each(archive, lambda file, place: (str(place), columns_of(file)), {*wanted}):
-            if isinstance(entry, ResultsError):
-                raise entry
-            found[entry[0]] = entry[1]
-    for path in {*wanted} - found.keys():
+    wanted, found = list(map(str, paths)), {}
+    # In sorted order, each archive is unpacked only once.
+    for path in sorted(set(wanted)):
         with opened(Path(path)) as file:
             found[path] = columns_of(file)
     return [found[path] for path in wanted]
@@ -219,34 +211,28 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
     return read_each(path, _row)
 
 
-def read_each(
-    path: Path, extract: Callable[[h5py.File, Path], T], wanted: set[str] | None = None
-) -> Iterator[T | ResultsError]:
+def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T | ResultsError]:
     """Yield the result of ``extract``, or an error, for a result file or for each run of an archive.
 
     Args:
         path: The file or archive.
         extract: Function of the open file and its path, or its path in an archive.
-        wanted: Members to read; None for all.
     """
-    try:
-        if not path.name.endswith(ARCHIVE_SUFFIX):
-            with opened(path) as file:
-                yield extract(file, path)
+    places = [path]
+    if path.name.endswith(ARCHIVE_SUFFIX):
+        try:
+            members = opened_archive(path).infolist()
+        except ResultsError as error:
+            yield error
             return
-        with opened_archive(path) as archive:
-            # Other programs add folders.
-            for name in (info.filename for info in archive.infolist() if not info.is_dir()):
-                place = path / name
-                if wanted is not None and str(place) not in wanted:
-                    continue
-                try:
-                    with opened_member(archive, name, place) as file:
-                        yield extract(file, place)
-                except ResultsError as error:
-                    yield error
-    except ResultsError as error:
-        yield error
+        # As text, because an absolute name would replace the archive's path. Other programs add folders.
+        places = [Path(f"{path}/{info.filename}") for info in members if not info.is_dir()]
+    for place in places:
+        try:
+            with opened(place) as file:
+                yield extract(file, place)
+        except ResultsError as error:
+            yield error
 
 
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
