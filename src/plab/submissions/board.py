@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import pandas as pd
 
@@ -23,10 +22,6 @@ from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_
 PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 """Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
-
-Point: TypeAlias = tuple[str, str, int, float]
-"""Task, variant, environment steps, score."""
-
 
 _TABLES = {
     "suite": ("plab's suite", "the targets of plab's own recipes", SUITE_VARIANTS),
@@ -78,9 +73,9 @@ def _table(
 
 
 def _line(
-    card: Card, track: str, status: str, variants: Sequence[str], points: Iterable[Point]
+    card: Card, track: str, status: str, variants: Sequence[str], points: pd.DataFrame
 ) -> dict[str, Any]:
-    """Return a line of a table.
+    """Return a line of a table, given ``points`` with the columns task, variant, steps and score.
 
     Returns:
         ``card``; ``track`` (``plans`` or ``policies``); ``status`` (``verified``, ``claimed`` or, for the
@@ -88,23 +83,18 @@ def _line(
         mean over all configurations of the table, missing ones counting as 0; ``budgets``, the same within
         each budget, None without entries; ``tasks``, the same by task, None without scores.
     """
-    table = pd.DataFrame(points, columns=["task", "variant", "steps", "score"])
-    each = len(variants)
+    each, by = len(variants), ["task", "variant"]
     expected = len(suite_tasks()) * each
-
-    def best(rows: pd.DataFrame) -> pd.DataFrame:
-        return rows.loc[rows.groupby(["task", "variant"])["score"].idxmax()]
-
-    within = [best(table[table["steps"] <= limit]) for limit in BUDGETS]
-    whole = best(table)
-    tasks = (whole.groupby("task")["score"].sum() / each).to_dict()
+    within = [points[points["steps"] <= limit].groupby(by)["score"].max() for limit in BUDGETS]
+    best = points.groupby(by)["score"].max()
+    tasks = (best.groupby("task").sum() / each).to_dict()
     return {
         "card": card,
         "track": track,
         "status": status,
-        "covered": len(whole),
-        "budgets": [float(rows["score"].sum()) / expected if len(rows) else None for rows in within],
-        "score": float(whole["score"].sum()) / expected,
+        "covered": len(best),
+        "budgets": [float(scores.sum()) / expected if len(scores) else None for scores in within],
+        "score": float(best.sum()) / expected,
         "tasks": [tasks.get(task) for task in suite_tasks()],
     }
 
@@ -127,15 +117,17 @@ def _submission_lines(path: Path, overrides: Sequence[str]) -> Iterator[tuple[st
         raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
     if verdicts and all(one.outcome == HOLDS for one in verdicts):
         status = "verified"
-    tables: dict[str, list[Point]] = defaultdict(list)
+    found = []
     for number, entry in enumerate(submission.entries):
         own, score = entry.configuration, entry.score
         if verdicts and not math.isnan(verdicts[number].score):
             score = verdicts[number].score
-        point = own.task, own.variant, entry.steps, score
-        tables["unseen" if own.variant in UNSEEN else "suite"].append(point)
-    for kind, points in tables.items():
-        yield kind, _line(submission.card, submission.track, status, _TABLES[kind][-1], points)
+        found.append((own.task, own.variant, entry.steps, score))
+    points = pd.DataFrame(found, columns=["task", "variant", "steps", "score"])
+    for kind, (_, _, variants) in _TABLES.items():
+        inside = points[points["variant"].isin(variants)]
+        if len(inside):
+            yield kind, _line(submission.card, submission.track, status, variants, inside)
 
 
 def _paper() -> dict[str, Any]:
@@ -147,7 +139,7 @@ def _paper() -> dict[str, Any]:
         card = replace(PAPER, name=look.label, gradient=gradient)
         points = own[["task", "variant"]].assign(steps=_PAPER_STEPS[gradient], score=own["iou_mean"])
         track = "plans" if gradient else "policies"
-        lines.append(_line(card, track, "printed", SUITE_VARIANTS, points.itertuples(index=False, name=None)))
+        lines.append(_line(card, track, "printed", SUITE_VARIANTS, points))
     protocol = (
         "protocol=release, the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
