@@ -25,7 +25,7 @@ COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", 
 
 FIRST = 10_000
 """``seed_scene`` of the first scene, above those of training (:mod:`plab.runners.shac`) and of submissions
-(:mod:`plab.submissions.schema`)."""
+(:mod:`plab.submissions.submission`)."""
 
 
 def scores_of(policy: Policy, cfgs: Sequence[Config], batch: EpisodeBatch) -> np.ndarray:
