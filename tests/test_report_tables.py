@@ -34,7 +34,7 @@ from plab.report.tables import (
 )
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load
-from plab.results.examples import EXAMPLES, example_archive
+from plab.results.examples import EXAMPLES, resolve
 
 GOLDEN = Path(__file__).parent / "golden"
 MINUS = "\N{MINUS SIGN}"
@@ -309,10 +309,10 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
     tables = {"authors": 8}.get(name, 10)
     assert f"{tables} tables of {count} out of" in capsys.readouterr().out
     if name != "authors":
-        assert all(not problem for _, problem in check(example_archive(name)))
+        assert all(not problem for _, problem in check(resolve(name)))
     page = (Path(__file__).parents[1] / "docs" / "reproduction.md").read_text("utf-8")
     for label, row in AGREEMENT.get(name, {}).items():
-        (table,) = agreement(gather(example_archive(name)))
+        (table,) = agreement(gather(resolve(name)))
         cells = table.cells.set_index("method")
         assert tuple(cells.loc[label, ["cells", "correlation", "agree"]]) == row
         assert " of ".join(row[:1] * 2) + f" | {row[1]} | {row[2]} |" in page

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["EXAMPLES", "example_archive", "measurements", "resolve"]
+__all__ = ["EXAMPLES", "measurements", "resolve"]
 
 EXAMPLES = ("example", "release", "authors")
 """Names of the bundled archives, accepted in place of a results folder: plab's own suite, the paper's
@@ -15,15 +15,11 @@ benchmark under the release's protocol, and `solve` on the authors' targets with
 particles."""
 
 
-def example_archive(name: str = EXAMPLES[0]) -> Path:
-    """Return a bundled archive by its name in :data:`EXAMPLES`."""
-    return Path(__file__).with_name(f"{name}.plab.zip.xz")
-
-
 def resolve(source: str | Path) -> Path:
     """Return a source of results, replacing names in :data:`EXAMPLES` by bundled archives; use ``./example``
     for a folder of that name."""
-    return _relative(example_archive(str(source))) if str(source) in EXAMPLES else Path(source)
+    archive = Path(__file__).with_name(f"{source}.plab.zip.xz")
+    return _relative(archive) if str(source) in EXAMPLES else Path(source)
 
 
 def measurements(folder: str | Path) -> Path:
