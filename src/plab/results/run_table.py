@@ -58,11 +58,9 @@ _ORIGIN = {"started": "start_time"} | {
 }
 """Provenance keys by column."""
 
-_BEST = ("best_iteration", "best_loss")
-
 COLUMNS = (
     *("task", "variant", "method", "seed", "status", "message", "score", "iou", "loss", "iterations"),
-    *(*_BEST, "seconds", *_ORIGIN, "config_hash", "path"),
+    *("best_iteration", "best_loss", "seconds", *_ORIGIN, "config_hash", "path"),
 )
 """Columns of every table of runs."""
 
@@ -191,8 +189,7 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
         try:
             yield root, root.stat()
         except OSError as error:
-            why = "does not exist" if not os.path.lexists(root) else f"cannot be read ({error.strerror})"
-            raise ResultsError(f"no results: {root} {why}") from None
+            raise ResultsError(f"no results in {root}: {error.strerror}") from None
         return
     closed: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
@@ -421,9 +418,13 @@ def scores(
     """
     found, unreadable = rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
+    looked_up = {key: key for key in keys} | _SETTINGS
     columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
-    table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
-    if strange := [key for key in keys if fitting and table[key].map(lambda value: value is None).all()]:
+    values = [
+        {name: lookup(row.config, key) for name, key in looked_up.items()} | row.values for row in fitting
+    ]
+    table = pd.DataFrame(values, columns=columns)
+    if strange := [key for key in keys if fitting and table[key].isna().all()]:
         raise ArgumentError(f"no run has '{strange[0]}': use columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
         raise ArgumentError(
@@ -476,12 +477,6 @@ def _connected(
         connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
         connection.unregister("frame")
     return connection, unreadable
-
-
-def _value(row: Row, name: str) -> Any:
-    """Return a run's value of a column or a setting, or None."""
-    value = row.values[name] if name in row.values else lookup(row.config, _SETTINGS.get(name, name))
-    return None if value != value or isinstance(value, dict) else value
 
 
 def _comparable(column: pd.Series) -> pd.Series:
