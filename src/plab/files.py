@@ -1,6 +1,7 @@
 """Reading of untrusted files (archives, NumPy arrays and shapes), and plab's cache folder.
 
-Files are read as data: nothing is unpickled, extracted or executed, and unpacked sizes are limited.
+Files are read as data: nothing is unpickled, extracted or executed, and unpacked sizes are limited. For
+damaged zip files, Python's libraries raise errors of many classes.
 """
 
 from __future__ import annotations
@@ -33,19 +34,12 @@ _RATIO, _SMALL = 200, 1 << 24
 _UNPACKING_MEMORY = 1 << 28
 """Maximum working memory of xz [B]; plab's own archives need a quarter."""
 
-_LONGEST_HEADER = 4096
-"""Longest header of an array [B]; NumPy's own take 128."""
-
 _LARGEST_SHAPE = 1 << 28
 """Largest file of a mesh, point cloud or mass tensor [B]; a million triangles as text take 250 MB."""
 
 
 UNFINISHED = ".unfinished-"
 """Prefix of files and folders while they are being written."""
-
-
-class UnreadableError(ValueError):
-    """Invalid file; the message is the reason, without the file's name."""
 
 
 class ShapeError(PlabError, ValueError):
@@ -62,20 +56,21 @@ def cache_dir() -> Path:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error's message as one line of bounded length, without control characters."""
-    return printable(str(error))[:300] or type(error).__name__
+    """Return an error's message as one line of bounded length, without control characters and, from the
+    operating system, without number and file."""
+    return printable(getattr(error, "strerror", None) or str(error))[:300] or type(error).__name__
 
 
 def regular_file(path: Path) -> os.stat_result:
     """Return the status of a file, and reject folders, pipes and devices, because opening one could block.
 
     Raises:
-        UnreadableError: If it is a folder, pipe or device.
+        ValueError: If it is a folder, pipe or device.
         OSError: If it does not exist, or permission is denied.
     """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
-        raise UnreadableError("it is a folder, pipe or device, not a file")
+        raise ValueError("it is a folder, pipe or device, not a file")
     return found
 
 
@@ -101,9 +96,9 @@ def unpacked_archive(path: Path) -> zipfile.ZipFile:
     Names of members never become paths.
 
     Raises:
-        UnreadableError: If it exceeds a size limit.
-        ValueError: If it is not such a file, or damaged.
+        ValueError: If it exceeds a size limit.
         OSError: If it cannot be opened.
+        Exception: If it is damaged.
     """
     found = regular_file(path)
     return _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino)
@@ -113,14 +108,14 @@ def read_members(path: Path, most: int = LARGEST) -> dict[str, bytes]:
     """Return the content of all members of a zip file, by name.
 
     Raises:
-        UnreadableError: If they would take more than ``most`` bytes.
-        ValueError: If it is not a zip file, or damaged.
+        ValueError: If they would take more than ``most`` bytes.
         OSError: If it cannot be opened.
+        Exception: If it is damaged.
     """
     regular_file(path)
-    with _damage(), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive:
         if sum(info.file_size for info in archive.infolist()) > most:
-            raise UnreadableError(f"it would unpack to more than the {most / 1e6:.3g} MB allowed")
+            raise ValueError(f"it would unpack to more than the {most / 1e6:.3g} MB allowed")
         return {name: member_bytes(archive, name) for name in archive.namelist()}
 
 
@@ -128,30 +123,18 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     """Return the content of a member of an archive.
 
     Raises:
-        UnreadableError: If it exceeds a size limit.
-        ValueError: If it is damaged or encrypted.
+        ValueError: If it exceeds a size limit.
         KeyError: If the archive has no such member.
+        Exception: If it is damaged or encrypted.
     """
     info = archive.getinfo(name)
     # Other compression methods unpack a whole member before its size is known.
     known = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     if not known or info.file_size > min(LARGEST, max(_SMALL, _RATIO * info.compress_size)):
-        raise UnreadableError(
+        raise ValueError(
             f"{name!r} would unpack from {info.compress_size} to {info.file_size} bytes, more than is allowed"
         )
-    with _damage():
-        return archive.read(info)
-
-
-@contextmanager
-def _damage() -> Iterator[None]:
-    """Convert arbitrary errors of a library's parser to ValueError."""
-    try:
-        yield
-    except (UnreadableError, OSError, MemoryError):
-        raise
-    except Exception as error:
-        raise ValueError(one_line(error)) from error
+    return archive.read(info)
 
 
 @functools.lru_cache(maxsize=1)
@@ -159,13 +142,12 @@ def _unpacked(path: Path, size: int, *_: int) -> zipfile.ZipFile:
     """Open a compressed zip file, cached by the other arguments, which identify its version."""
     most = min(LARGEST, max(_SMALL, _RATIO * size))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING_MEMORY)
-    with _damage():
-        content = unpacker.decompress(path.read_bytes(), most)
-        if not unpacker.eof and len(content) == most:
-            raise UnreadableError(f"it would unpack to more than the {most} bytes allowed")
-        if not unpacker.eof or unpacker.unused_data:
-            raise ValueError("it is truncated, or followed by other data")
-        return zipfile.ZipFile(io.BytesIO(content))
+    content = unpacker.decompress(path.read_bytes(), most)
+    if not unpacker.eof and len(content) == most:
+        raise ValueError(f"it would unpack to more than the {most} bytes allowed")
+    if not unpacker.eof or unpacker.unused_data:
+        raise ValueError("it is truncated, or followed by other data")
+    return zipfile.ZipFile(io.BytesIO(content))
 
 
 # ----------------------------------------------------------------------------------------------------- arrays
@@ -175,8 +157,7 @@ def read_array(path: Path) -> np.ndarray:
     """Return the array of a ``.npy`` file.
 
     Raises:
-        UnreadableError: If it is not a ``.npy`` file, truncated, or contains data other than numbers and
-            text.
+        ValueError: If it is not a ``.npy`` file, truncated, or contains data other than numbers and text.
         OSError: If it cannot be opened.
     """
     regular_file(path)
@@ -188,28 +169,28 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by name.
 
     Raises:
-        UnreadableError: If it contains data other than numbers and text.
-        ValueError: If it is not an ``.npz`` file, or damaged.
+        ValueError: If it contains data other than numbers and text.
         OSError: If it cannot be opened.
+        Exception: If it is not an ``.npz`` file, or damaged.
     """
     arrays = {}
     for name, content in read_members(path).items():
         try:
             arrays[name.removesuffix(".npy")] = array_in(io.BytesIO(content))
-        except UnreadableError as error:
-            raise UnreadableError(f"{name}: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     return arrays
 
 
 def array_in(file: BinaryIO) -> np.ndarray:
     """Return the array of an open ``.npy`` file; see :func:`read_array`."""
     try:
-        with _damage():
-            array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)
-    except ValueError as error:
-        raise UnreadableError(f"it is not a NumPy array of numbers or text ({error})") from error
+        array = np.lib.format.read_array(file, allow_pickle=False)
+    # NumPy's parser raises errors of many classes for damaged headers.
+    except Exception as error:
+        raise ValueError(f"it is not a NumPy array of numbers or text ({one_line(error)})") from error
     if array.dtype.kind not in "biufU":
-        raise UnreadableError(f"it contains {array.dtype}, neither numbers nor text")
+        raise ValueError(f"it contains {array.dtype}, neither numbers nor text")
     return array
 
 
@@ -243,10 +224,10 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
     path = found.absolute()
     try:
         if regular_file(path).st_size > _LARGEST_SHAPE:
-            raise UnreadableError(f"it has more than {_LARGEST_SHAPE / 1e6:.0f} MB")
+            raise ValueError(f"it has more than {_LARGEST_SHAPE / 1e6:.0f} MB")
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except (UnreadableError, OSError) as error:
-        raise ShapeError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    except (ValueError, OSError) as error:
+        raise ShapeError(f"{path} cannot be read: {one_line(error)}") from None
     if sha256 not in (None, digest):
         raise ShapeError(
             f"{path} differs from the file of this configuration: its SHA-256 begins with {digest[:8]}, not "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -20,7 +19,7 @@ import numpy as np
 from plab.config.families import FAMILIES
 from plab.config.selection import lookup
 from plab.errors import PlabError
-from plab.files import LARGEST, UnreadableError, member_bytes, one_line, regular_file, unpacked_archive
+from plab.files import LARGEST, member_bytes, one_line, regular_file, unpacked_archive
 from plab.plugins import pandas as pd
 
 SCHEMA_VERSION = 2
@@ -62,8 +61,6 @@ _COMPACT = ("v110", "v110")
 
 _RATIO, _SMALL = 1_100, 1 << 16
 """Maximum compression ratio of a dataset (deflate: 1,032), and minimum size for this limit."""
-
-_images = itertools.count()
 
 
 class ResultsError(PlabError, RuntimeError):
@@ -222,8 +219,8 @@ def replace_file(path: Path, content: bytes | str, *, sync: bool = False) -> Non
     except OSError as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        why = error.strerror or error
-        raise ResultsError(f"cannot write {path} ({len(content) / 1e6:.1f} MB): {why}") from error
+        size = f"{len(content) / 1e6:.1f} MB"
+        raise ResultsError(f"cannot write {path} ({size}): {one_line(error)}") from error
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
@@ -232,9 +229,7 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
     Targets from user files are left out, because their licence is unknown.
     """
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if compress else {}
-    # A unique name, because Ctrl-C inside h5py can leave the previous image open under its name.
-    name = f"image{next(_images)}"
-    with h5py.File(name, "w", driver="core", backing_store=False, libver=_COMPACT) as file:
+    with h5py.File.in_memory(libver=_COMPACT) as file:
         file.attrs["format"] = "plab-run"
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["config"] = json.dumps(result.config)
@@ -349,24 +344,18 @@ def explained(path: Path) -> Iterator[None]:
         yield
     except ResultsError:
         raise
-    except (FileNotFoundError, PermissionError, UnreadableError) as error:
-        why = getattr(error, "strerror", None) or one_line(error)
-        raise ResultsError(f"{path} cannot be read: {why}") from error
     except Exception as error:
-        raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
+        raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
 
 
 def _require_version(file: h5py.File, path: Path) -> None:
     if file.attrs.get("format") != "plab-run":
         raise ResultsError(f"{path} is not a plab result file")
     version = int(file.attrs["schema_version"])
-    if version > SCHEMA_VERSION:
-        raise NewerSchemaError(
-            f"{path} was written by a newer plab (schema version {version}, this one knows "
-            f"{SCHEMA_VERSION}): install that, or choose another results_dir"
-        )
     if version != SCHEMA_VERSION:
-        raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
+        kind = NewerSchemaError if version > SCHEMA_VERSION else ResultsError
+        why = f"has schema version {version}, this plab reads {SCHEMA_VERSION}"
+        raise kind(f"{path} {why}: use the plab that wrote it, or choose another results_dir")
 
 
 def summary_of(file: h5py.File) -> dict[str, Any]:

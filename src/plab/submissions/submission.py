@@ -24,7 +24,7 @@ import yaml
 import plab
 from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.files import UnreadableError, array_in, one_line, read_members
+from plab.files import array_in, one_line, read_members
 from plab.results import ResultsError
 from plab.results.archive import zipped
 from plab.results.run_file import explained, replace_file
@@ -190,15 +190,7 @@ _CARD_KINDS = {
 
 def _require(fits: bool, fault: str) -> None:
     if not fits:
-        raise UnreadableError(fault)
-
-
-class _CardLoader(yaml.SafeLoader):
-    """Loader without aliases, because a few nested ones expand to billions of values."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        _require(not self.check_event(yaml.AliasEvent), "it contains an alias (*name): write the value out")
-        return super().compose_node(parent, index)
+        raise ValueError(fault)
 
 
 def parse_card(text: bytes, source: str) -> Card:
@@ -209,11 +201,14 @@ def parse_card(text: bytes, source: str) -> Card:
     """
     try:
         _require(len(text) <= _CARD_BYTES, f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
-        record = yaml.load(text.decode("utf-8"), _CardLoader)
+        # A few nested aliases expand to billions of values.
+        aliases = (isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader))
+        _require(not any(aliases), "it contains an alias (*name): write the value out")
+        record = yaml.safe_load(text.decode("utf-8"))
         _require(isinstance(record, dict), f"a card has the keys {', '.join(_CARD_KINDS)}")
         record = {"description": ""} | record
         if odd := record.keys() ^ _CARD_KINDS.keys():
-            raise UnreadableError(f"the key {min(odd, key=str)!r:.60} is missing or unknown")
+            raise ValueError(f"the key {min(odd, key=str)!r:.60} is missing or unknown")
         for key, kind in _CARD_KINDS.items():
             _require(type(record[key]) is kind, f"{key} must be of type {kind.__name__}")
         _require(0 <= record["budget"] < _STEPS, f"budget must be from 0 to {_STEPS - 1}")
@@ -315,8 +310,8 @@ def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
         return Entry(configuration, *claim, policy=file)
     try:
         actions = array_in(io.BytesIO(members[file]))
-    except UnreadableError as error:
-        raise UnreadableError(f"{file}: {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     fits = actions.dtype == "<f8" and actions.ndim == 2 and actions.size > 0
     _require(fits, f"{file} must hold float64 numbers of shape [steps, components]")
     _require(bool((np.abs(actions) <= 1.0).all()), f"{file} holds actions outside of [-1, 1]")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -23,8 +23,6 @@ import plab
 from plab.config import Config
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
-from plab.errors import print_error
-from plab.files import UnreadableError
 from plab.render import rollouts
 from plab.report.statistics import BUDGETS, rows_on_axes
 from plab.results import Row, read_curves
@@ -238,9 +236,10 @@ def _reason(error: Exception) -> str:
 # ----------------------------------------------------------------------------------------------------- files
 
 
-def _beside(submission: Submission) -> Path | None:
-    path = submission.path
-    return path and path.with_name(path.name.removesuffix(SUFFIX) + ".verified.json")
+def _beside(submission: Submission) -> Path:
+    """Return the verification file of a submission that was read from a file."""
+    path = cast(Path, submission.path)
+    return path.with_name(path.name.removesuffix(SUFFIX) + ".verified.json")
 
 
 def write_verification(verdicts: Sequence[Verdict], submission: Submission, overrides: Sequence[str]) -> Path:
@@ -250,7 +249,6 @@ def write_verification(verdicts: Sequence[Verdict], submission: Submission, over
         plab.results.ResultsError: If the file cannot be written.
     """
     path = _beside(submission)
-    assert path is not None
     entries = [
         {"name": one.entry.name, "claimed": one.entry.score, "score": one.score}
         | {"outcome": one.outcome, "why": one.why}
@@ -269,7 +267,7 @@ def read_verification(submission: Submission) -> list[Verdict]:
         plab.results.ResultsError: If the verification file cannot be read.
     """
     path = _beside(submission)
-    if path is None or not path.exists():
+    if not path.exists():
         return []
     with explained(path):
         record = json.loads(path.read_bytes())
@@ -280,7 +278,7 @@ def read_verification(submission: Submission) -> list[Verdict]:
         for one in verdicts:
             scored = type(one.score) is float and (0.0 <= one.score <= 1.0 or math.isnan(one.score))
             if not scored or one.outcome not in _OUTCOMES or (one.outcome == HOLDS and math.isnan(one.score)):
-                raise UnreadableError(f"{one.entry.name}: {one.outcome!r:.60}, score {one.score!r:.60}")
+                raise ValueError(f"{one.entry.name}: {one.outcome!r:.60}, score {one.score!r:.60}")
         return verdicts
 
 
@@ -369,21 +367,17 @@ def record(env: Env, folder: str | Path) -> Env:
             _ledgers[path] = _BestEpisodes(cfg, path)
         ledgers.append(_ledgers[path])
     taken: deque[np.ndarray] = deque(maxlen=batch.horizon)
-    told = False
 
     def observe(actions: Any, result: Transition) -> None:
-        nonlocal told
         taken.append(np.array(actions, np.float64))
         for ledger in ledgers:
             ledger.steps += 1
         if not result.truncated.any():
             return
         if "randomized" in result.info:
-            if not told:
-                print_error(
-                    f"{folder}: randomised episodes are not recorded: evaluate in the task as configured"
-                )
-            told = True
+            rollouts.print_once(
+                f"{folder}: randomised episodes are not recorded: evaluate in the task as configured"
+            )
             return
         # The last steps of a complete episode are the whole episode.
         episodes = np.stack(taken, axis=1)

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.errors import located
-from plab.files import UnreadableError, cache_dir, read_array, read_arrays
+from plab.files import cache_dir, read_array, read_arrays
 from plab.plugins import Registry
 from plab.scenes import Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError, TensorRecipe
@@ -187,7 +187,7 @@ class TargetStore:
             kept = read_arrays(self.path(scene, actions))
             mass = np.zeros(n**3)
             mass[kept["node"]] = kept["mass"]
-        except (OSError, KeyError, ValueError, IndexError, TypeError, MemoryError):
+        except Exception:
             return None
         return mass.reshape(n, n, n) if np.isfinite(mass).all() and mass.any() else None
 
@@ -221,19 +221,17 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
         mass = read_array(path)
         if mass.shape != (n, n, n) or mass.dtype.kind not in "fiu" or not np.isfinite(mass).all():
             needed = f"the grid needs finite numbers of shape {(n, n, n)}"
-            raise UnreadableError(f"has shape {mass.shape} of {mass.dtype}, {needed}")
+            raise ValueError(f"has shape {mass.shape} of {mass.dtype}, {needed}")
         negative, total = -float(mass.clip(None, 0).sum()) / unit, float(mass.sum()) / unit
         if negative > NEGATIVE_PARTICLES:
             most = f"at most {NEGATIVE_PARTICLES:g} in the release's files: the least is {mass.min():.3g}"
-            raise UnreadableError(f"has negative masses, {negative:.3g} particle masses in all, {most}")
+            raise ValueError(f"has negative masses, {negative:.3g} particle masses in all, {most}")
         expected = (scene.particle_count, RELEASE_PARTICLES)
         if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
-            raise UnreadableError(
-                f"has the mass of {total:.0f} particles, not {' or '.join(map(str, expected))}"
-            )
+            raise ValueError(f"has the mass of {total:.0f} particles, not {' or '.join(map(str, expected))}")
     except FileNotFoundError:
         reason = "does not exist; name the files like Move3D-v1.npy"
         raise TargetError(f"targets.source: {path} {reason}") from None
-    except (UnreadableError, OSError) as error:
+    except (ValueError, OSError) as error:
         raise TargetError(f"targets.source: {path} {getattr(error, 'strerror', None) or error}") from None
     return mass.astype(np.float64)
