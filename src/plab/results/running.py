@@ -8,8 +8,6 @@ without locks, no run is computed.
 
 from __future__ import annotations
 
-import dataclasses
-import errno
 import functools
 import itertools
 import logging
@@ -20,8 +18,9 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -31,6 +30,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from plab.config.run import config_dict, config_hash, member_name
+from plab.files import one_line
 from plab.results.run_file import (
     PARTIAL_SUFFIX,
     REPLAY_SUFFIX,
@@ -52,6 +52,7 @@ class RunFile:
 
     Attributes:
         path: Final file.
+        result: Result so far, including earlier processes.
         partial_path: File with the state of the run in progress.
     """
 
@@ -67,17 +68,15 @@ class RunFile:
         digest = config_hash(config)
         self.path = Path(config["results_dir"]) / member_name(config, digest)
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
-        # Result, and rows not yet in its columns. A single object, because an interrupt may arrive between
-        # assignments.
-        known = RunResult(config, digest, provenance=provenance(config))
-        self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
+        # Always replaced as a whole, because an interrupt may arrive between assignments.
+        self.result = RunResult(config, digest, provenance=provenance(config))
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
         # Number of iterations of earlier processes.
         self._known = 0
         earlier = self._finished_earlier()
         if earlier is not None and not config["force"]:
-            self._state = earlier, ()
+            self.result = earlier
             # Left by a process that was killed just after finishing; a locked run is being recomputed.
             with suppress(OSError):
                 if lock_path(self.path).exists() or self.partial_path.exists():
@@ -95,7 +94,7 @@ class RunFile:
             self._remove(*([PARTIAL_SUFFIX] if config["force"] else []))
             if not config["force"]:
                 self._take_up_earlier()
-            self._known = self._state[0].rows
+            self._known = self.result.rows
             if self.finished:
                 self.release()
             elif not self.partial_path.exists():
@@ -104,8 +103,7 @@ class RunFile:
         except BaseException as error:
             self._release_empty_folders()
             if isinstance(error, OSError):
-                why = error.strerror or error
-                raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
+                raise ResultsError(f"cannot write to {self.path.parent}: {one_line(error)}") from error
             raise
 
     def _remove(self, *suffixes: str) -> None:
@@ -130,17 +128,9 @@ class RunFile:
                 folder.rmdir()
 
     @property
-    def result(self) -> RunResult:
-        """Result so far, including earlier processes."""
-        known, rows = self._state
-        if rows:
-            self._state = dataclasses.replace(known, columns=_extended(known.columns, rows)), ()
-        return self._state[0]
-
-    @property
     def finished(self) -> bool:
         """True if this process or an earlier one has completed the run."""
-        return self._state[0].status == "finished"
+        return self.result.status == "finished"
 
     @property
     def advanced(self) -> bool:
@@ -154,7 +144,7 @@ class RunFile:
 
     def add_time(self, name: str, seconds: float) -> None:
         """Add to the wall time of a phase."""
-        times = self._state[0].wall_time
+        times = self.result.wall_time
         times[name] = times.get(name, 0.0) + seconds
 
     def record(
@@ -168,15 +158,15 @@ class RunFile:
             keep: Whether to write the partial file in any case.
             changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
         """
-        known, rows = self._state
-        self._state = dataclasses.replace(known, resume=dict(resume), **changes), (*rows, dict(row))
+        columns = _extended(self.result.columns, row)
+        self.result = replace(self.result, columns=columns, resume=dict(resume), **changes)
         now = time.monotonic()
         if keep or now - self._written >= self._every:
             self._write()
 
     def close(self, status: str, message: str) -> None:
         """Mark an unfinished run ``failed`` or ``stopped``, and keep its state in the partial file."""
-        self._state = dataclasses.replace(self.result, status=status, message=message), ()
+        self.result = replace(self.result, status=status, message=message)
         try:
             self._write()
         finally:
@@ -189,7 +179,7 @@ class RunFile:
     def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
         """Write the final file, with the scalars of the evaluation and mass tensors, shape [n, n, n] each,
         and remove the partial file."""
-        result = dataclasses.replace(
+        result = replace(
             self.result,
             status="finished",
             message="",
@@ -199,7 +189,7 @@ class RunFile:
             path=self.path,
         )
         write(result, self.path, compress=True)
-        self._state = result, ()
+        self.result = result
         # Files that cannot be removed are left to the next process.
         with suppress(OSError):
             self.partial_path.unlink(missing_ok=True)
@@ -213,13 +203,13 @@ class RunFile:
         except ResultsError:
             # Missing or damaged files are handled under the lock.
             return None
-        same = earlier.config_hash == self._state[0].config_hash
+        same = earlier.config_hash == self.result.config_hash
         return earlier if same and earlier.status == "finished" else None
 
     def _take_up_earlier(self) -> None:
         """Resume from the state of an earlier process; unusable files are moved aside."""
         if (done := self._finished_earlier()) is not None:
-            self._state = done, ()
+            self.result = done
             return
         for path in (self.path, self.partial_path):
             if not path.exists():
@@ -242,26 +232,20 @@ class RunFile:
             versions = (*(name.removesuffix("-core") for name in _PACKAGES), "python", "git_commit")
             if changed := [name for name in versions if before.get(name) != now[name]]:
                 listed = ", ".join(f"{name} {before.get(name)} -> {now[name]}" for name in changed)
-                _log.warning(
-                    "resuming %s, which was started with other versions: %s", self.partial_path, listed
-                )
+                _log.warning("%s was started with other versions: %s", self.partial_path, listed)
             origin = before | {"resumed": int(before.get("resumed", 0)) + 1}
-            known = dataclasses.replace(earlier, status="running", message="", provenance=origin, path=None)
-            self._state = known, ()
+            self.result = replace(earlier, status="running", message="", provenance=origin, path=None)
 
 
-def _extended(
-    columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, float]]
-) -> dict[str, np.ndarray]:
-    """Return columns, shape [iteration] each, extended by rows; missing values are NaN."""
+def _extended(columns: Mapping[str, np.ndarray], row: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Return columns, shape [iteration] each, extended by a row; missing values are NaN."""
     known = len(next(iter(columns.values()), ()))
     extended = {}
-    for name in dict.fromkeys((*columns, *rows[0])):
-        new = [row.get(name, math.nan) for row in rows]
+    for name in dict.fromkeys((*columns, *row)):
+        value = row.get(name, math.nan)
         # Counts are integers, all other columns are float64.
-        counts = all(isinstance(number, int | np.integer) for number in new)
-        added = np.array(new, np.int64 if counts else np.float64)
-        before = columns.get(name, np.full(known, math.nan))
+        added = np.array([value], np.int64 if isinstance(value, int | np.integer) else np.float64)
+        before = columns[name] if name in columns else np.full(known, math.nan)
         extended[name] = np.concatenate([before, added]) if known else added
     return extended
 
@@ -271,27 +255,17 @@ def _extended(
 _PATIENCE = 0.2
 """Timeout of :func:`acquire` [s], longer than :func:`held` holds a lock."""
 
-_NOT_HELD = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EROFS)
-"""Error numbers of file systems without locks or without write access, on which no run can be in progress."""
 
-
-class Lock:
+class Lock(FileLock):
     """Lock held by this process until :meth:`release` or garbage collection."""
 
-    def __init__(self, path: str | Path, timeout: float = _PATIENCE) -> None:
-        """Acquire the lock of a run, as :func:`acquire` does; raise filelock.Timeout after the timeout."""
-        file, often = lock_path(path), _PATIENCE / 8
-        # The soft lock of a killed process would never be released.
-        self._lock = FileLock(file, timeout, thread_local=False, poll_interval=often, fallback_to_soft=False)
-        self._lock.acquire()
-
-    def release(self) -> None:
+    def release(self, force: bool = False) -> None:
         """Release the lock and remove its file; further calls have no effect."""
-        if self._lock.is_locked:
+        if self.is_locked:
             # An empty file may remain on Windows, which cannot remove open files, and on read-only disks.
             with suppress(OSError):
-                Path(self._lock.lock_file).unlink(missing_ok=True)
-            self._lock.release()
+                Path(self.lock_file).unlink(missing_ok=True)
+        super().release(force)
 
 
 def lock_path(path: str | Path) -> Path:
@@ -300,7 +274,7 @@ def lock_path(path: str | Path) -> Path:
     return path.with_name(path.name.removesuffix(".h5").removesuffix(".partial") + ".lock")
 
 
-def acquire(path: str | Path) -> Lock | None:
+def acquire(path: str | Path, timeout: float = _PATIENCE) -> Lock | None:
     """Acquire the lock of a run, given its final or partial result file in an existing folder.
 
     Returns:
@@ -309,8 +283,11 @@ def acquire(path: str | Path) -> Lock | None:
     Raises:
         OSError: If the lock file cannot be created, or its file system has no locks.
     """
+    # The soft lock of a killed process would never be released.
+    lock = Lock(lock_path(path), timeout, thread_local=False, fallback_to_soft=False)
     with suppress(Timeout):
-        return Lock(path)
+        lock.acquire()
+        return lock
     return None
 
 
@@ -319,14 +296,14 @@ def held(path: str | Path) -> bool:
     if not lock_path(path).exists():
         return False
     try:
-        # Not locked: left by a killed process, or removed by its holder just before it was opened.
-        Lock(path, 0.0).release()
-    except Timeout:
-        return True
+        lock = acquire(path, 0.0)
     except OSError as error:
-        # A file that cannot be opened belongs to another user.
-        return error.errno not in _NOT_HELD
-    return False
+        # A file that cannot be opened belongs to another user; without locks, no run can be in progress.
+        return isinstance(error, PermissionError)
+    if lock is not None:
+        # Left by a killed process, or removed by its holder just before it was opened.
+        lock.release()
+    return lock is None
 
 
 # ------------------------------------------------------------------------------------------------- provenance
