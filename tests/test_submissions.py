@@ -216,7 +216,7 @@ def test_cards_that_are_read() -> None:
         ("budget: 0x" + "f" * 7000, "budget"),
         ('name: "\\e[31mred"', "control"),
         ('authors: ["\\ud800"]', "control"),
-        ("name: " + "[" * 3000, "recursion"),
+        ("name: " + "[" * 3000 + "]" * 3000, "recursion"),
     ],
 )
 def test_cards_that_are_refused(line: str, fault: str) -> None:
