@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from argparse import Namespace
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -45,13 +46,13 @@ def age(path: Path, seconds: float = 60.0) -> None:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the files opened."""
     names: list[str] = []
-    read = run_table.read_rows
+    read = run_table.read_each
 
-    def counting(path: Path):
+    def counting(path: Path, extract: Callable):
         names.append(path.name)
-        return read(path)
+        return read(path, extract)
 
-    monkeypatch.setattr(run_table, "read_rows", counting)
+    monkeypatch.setattr(run_table, "read_each", counting)
     return names
 
 

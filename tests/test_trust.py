@@ -26,7 +26,6 @@ from plab.cli import status
 from plab.config import build_scene, load_config
 from plab.config.families import FAMILIES
 from plab.results import ResultsError, check, read, unpack
-from plab.results.run_table import read_rows
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, save_policy
 from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target
@@ -139,9 +138,8 @@ def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
     make, named = ARCHIVES[case]
     archive, out = tmp_path / "a.plab.zip.xz", tmp_path / "out"
     archive.write_bytes(lzma.compress(make(saved(tmp_path / "results").read_bytes()), preset=0))
-    (line,) = (str(row) for row in read_rows(archive))
+    line = said(unpack, archive, out)
     assert line.startswith(str(archive)) and named in line
-    assert said(unpack, archive, out) == line
     assert not out.exists()
     ((_, problem),) = check(archive)
     assert problem and problem in line

@@ -195,17 +195,11 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
         subfolders.sort()
         for name in sorted(name for name in names if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
-            # As text, because pathlib is slower than the file system. A run removes its partial file when it
-            # ends.
-            path = os.path.join(folder, name)
+            path = Path(folder, name)
+            # A run removes its partial file when it ends.
             with suppress(FileNotFoundError):
-                yield Path(path), os.stat(path)
+                yield path, path.stat()
     yield from ((path, path.lstat()) for path in closed)
-
-
-def read_rows(path: Path) -> Iterator[Row | ResultsError]:
-    """Yield the rows of a result file or an archive, or an error."""
-    return read_each(path, _row)
 
 
 def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T | ResultsError]:
@@ -257,10 +251,10 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
                 # The same folder may have another path in the next call.
                 yield Row(values | {"path": str(path / member)}, config)
             continue
-        own = list(read_rows(path))
+        own = list(read_each(path, _row))
         if not path.exists():
             # The run has ended since the folder was listed.
-            own = list(read_rows(_final(path))) if _final(path).exists() else []
+            own = list(read_each(_final(path), _row)) if _final(path).exists() else []
         yield from own
         found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
         # Damaged files are read again, because the message is part of the result.
@@ -288,9 +282,6 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
         by_hash[row.values["config_hash"]].append(row)
     kept = []
     for same in by_hash.values():
-        if len(same) == 1:
-            kept += same
-            continue
         best = [row for row in same if row.values["status"] == "finished"] or same
         loose = [row for row in best if split_archive(row.path) is None]
         kept += loose or best[:1]
@@ -383,7 +374,7 @@ def query(
     except duckdb.Error as error:
         # Omit hints and the marked position in the query.
         first = " ".join(str(error).partition("\n")[0].split())
-        raise ArgumentError(f"{first}; the tables are {', '.join(_TABLES)}") from None
+        raise ArgumentError(f"{first}; the tables are runs, config and iterations") from None
     except RuntimeError as error:
         # DuckDB receives Ctrl-C itself.
         if "interrupted" in str(error).lower():
@@ -440,8 +431,6 @@ def scores(
 
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
 """Columns, by configuration key, that must agree between runs that are averaged."""
-
-_TABLES = ("runs", "config", "iterations")
 
 _TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets", "folder")
 """Text columns of ``runs``, even if all values are missing."""
