@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -194,7 +194,6 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
     """
     try:
         composed.method = _typed_method(composed.method, "method")
-        _reject_unknown(composed, "")
         # Hydra closes all dictionaries, but a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
         overrides = parse(words)
@@ -208,11 +207,11 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
             composed.task.merge_with(composed.task.release)
         composed.task.release = {}
         _choose_variant(composed, overrides)
-        parts = vars(OmegaConf.to_object(composed))
+        made = cast(_Composed, OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
-    cfg = Config(**parts)
-    cfg.check()
+    made.check()
+    cfg = Config(**vars(made))
     cfg.results_dir = str(Path(cfg.results_dir).expanduser())
     if cfg.targets.source is not None:
         cfg.targets.source = str(Path(cfg.targets.source).expanduser())
@@ -366,11 +365,7 @@ def _choose_profile(method: DictConfig) -> None:
 
 def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
     """Resolve references to tables, and empty the tables."""
-    for key, node in section.items_ex(resolve=False):
-        if OmegaConf.is_interpolation(section, str(key)):
-            section[key] = section[key]
-        elif key not in set(tables) and OmegaConf.is_config(node):
-            OmegaConf.resolve(node)
+    OmegaConf.resolve(section)
     for table in tables:
         section[table] = {}
 
@@ -394,15 +389,3 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     except OmegaConfBaseException as error:
         raise ConfigError(f"variant {composed.variant} of task {task.name}: {explain(error)}") from None
     task.variants, task.random = {composed.variant: changes}, {}
-
-
-def _reject_unknown(node: Any, path: str) -> None:
-    """Reject keys that no dataclass defines, because Hydra lets ``+key=value`` add them."""
-    if not isinstance(node, DictConfig) or node._is_missing() or node._is_none() or node._is_interpolation():
-        return
-    kind = OmegaConf.get_type(node)
-    known = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else None
-    for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
-        if known is not None and key not in known:
-            raise ConfigError(f"unknown key '{path}{key}'; {suggest(key, known)}")
-        _reject_unknown(below, f"{path}{key}.")

@@ -18,11 +18,6 @@ from plab.errors import ConfigError
 from plab.objective import check_terms
 from plab.scenes import CONTACTS, CONVENTIONS, DEVICES, MATERIAL_KEYS, PRECISIONS
 
-LOGGERS = ("none", "tensorboard", "wandb")
-
-SCORES = ("best", "last")
-"""Choices of ``protocol.score``, the iteration whose score is the run's score."""
-
 
 @dataclass
 class MethodConfig(ranges.Section):
@@ -44,14 +39,12 @@ class MethodConfig(ranges.Section):
     family: str
     contact: str = field(metadata=ranges.within(ranges.one_of, CONTACTS))
     softness: float = field(metadata=ranges.POSITIVE)
-    loss_weights: dict[str, float]
+    loss_weights: dict[str, float] = field(metadata=ranges.FINITE)
     loss_terms: dict[str, str]
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        for name, weight in self.loss_weights.items():
-            ranges.at_least(f"{path}.loss_weights.{name}", weight, 0, finite=True)
         check_terms(self.loss_weights, self.loss_terms)
         if not any(self.loss_weights.values()):
             raise ConfigError(f"{path}.loss_weights are all 0: at least one must be positive")
@@ -110,7 +103,7 @@ class ProtocolConfig(ranges.Section):
     start: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
     numbers: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
     floor: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
-    score: str = field(metadata=ranges.within(ranges.one_of, SCORES))
+    score: str = field(metadata=ranges.within(ranges.one_of, ("best", "last")))
     contact: str
 
     def check(self, path: str) -> None:
@@ -120,7 +113,7 @@ class ProtocolConfig(ranges.Section):
 
 
 @dataclass
-class TargetsConfig:
+class TargetsConfig(ranges.Section):
     """Source of the targets.
 
     Attributes:
@@ -169,7 +162,7 @@ class Config(ranges.Section):
     results_dir: str
     force: bool
     progress: bool
-    logger: str = field(metadata=ranges.within(ranges.one_of, LOGGERS))
+    logger: str = field(metadata=ranges.within(ranges.one_of, ("none", "tensorboard", "wandb")))
     checkpoint_seconds: float = field(metadata=ranges.FINITE)
 
     @property
@@ -203,11 +196,9 @@ class Config(ranges.Section):
 SUFFIX = ".h5"
 """Suffix of result files."""
 
-RUN_ONLY_KEYS = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
-"""Keys used only by ``plab run``."""
-
 _NO_EFFECT = {
-    "": RUN_ONLY_KEYS,
+    # Used only by plab run.
+    "": ("results_dir", "force", "progress", "logger", "checkpoint_seconds"),
     # Gradients are bitwise independent of the spacing of checkpoints.
     "sim": ("memory_mb",),
     # Name and score do not affect the numbers, and the method determines the contact term.

@@ -140,7 +140,7 @@ class KinematicsConfig(ranges.Section):
     """
 
     model: str
-    scale: dict[str, float]
+    scale: dict[str, float] = field(metadata=ranges.UNIT)
     root: str | None = None
     size: float = field(default=1.0, metadata=ranges.POSITIVE)
     position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.5], metadata=ranges.POINT)
@@ -149,7 +149,7 @@ class KinematicsConfig(ranges.Section):
     )
     free: bool = False
     start: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, list[float]] = field(default_factory=dict)
+    limits: dict[str, list[float]] = field(default_factory=dict, metadata=ranges.within(ranges.vector, 2))
     together: dict[str, str] = field(default_factory=dict)
     omit: list[str] = field(default_factory=list)
     friction: float = field(default=5.0, metadata=ranges.NOT_NEGATIVE)
@@ -159,12 +159,8 @@ class KinematicsConfig(ranges.Section):
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         for pattern, bounds in self.limits.items():
-            ranges.vector(f"{path}.limits.{pattern}", bounds, 2)
             if bounds[0] > bounds[1]:
                 raise ConfigError(f"{path}.limits.{pattern}: low {bounds[0]:g} is above high {bounds[1]:g}")
-        for pattern, value in self.scale.items():
-            if not 0 <= value <= 1:
-                raise ConfigError(f"{path}.scale.{pattern} must be in [0, 1], not {value:g}")
         if not math.isclose(math.hypot(*self.rotation), 1.0, abs_tol=1e-3):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 

@@ -48,7 +48,7 @@ class MultistartConfig(PlannerConfig):
             candidate, within ``action_init``.
     """
 
-    lrs: list[float]
+    lrs: list[float] = field(metadata=ranges.RATES)
     betas: list[float] = field(metadata=ranges.DECAYS)
     eps: float = field(metadata=ranges.POSITIVE)
     updates: int = field(metadata=ranges.COUNT)
@@ -58,10 +58,6 @@ class MultistartConfig(PlannerConfig):
 
     def check(self, path: str) -> None:
         super().check(path)
-        if not self.lrs:
-            raise ConfigError(f"{path}.lrs is empty: set at least one learning rate")
-        for lr in self.lrs:
-            ranges.positive(f"{path}.lrs", lr)
         if self.softness_end is not None and self.contact == "hard":
             raise ConfigError(f"{path}.softness_end has no effect with contact=hard: omit it")
 
