@@ -121,7 +121,7 @@ def test_ctrl_c_while_a_command_starts(tmp_path):
     code = "from plab.cli.command import *\nwith prompt_interrupts():\n try: {}\n except BaseException: pass"
     done = subprocess.run([sys.executable, "-c", code.format(kill)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "plab: stopped\n")
-    (tmp_path / "yaml.py").write_text(f"import os, signal, time; {kill}; time.sleep(9)")
+    (tmp_path / "difflib.py").write_text(f"import os, signal, time; {kill}; time.sleep(9)")
     done = subprocess.run([sys.executable, "-m", "plab"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from plab.errors import ConfigError
 
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
@@ -50,24 +48,17 @@ def group_names(group: str) -> list[str]:
 @functools.cache
 def shipped_file(group: str, name: str) -> Mapping[str, Any]:
     """Return the content of one of plab's own files merged over its bases; empty if it does not exist."""
+    # Imported here, because most commands do without it.
+    from omegaconf import OmegaConf
+
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}
-    own = yaml.safe_load(path.read_text(encoding="utf-8"))
-    merged: dict[str, Any] = {}
-    for base in own.get("defaults", ()):
-        if isinstance(base, str) and base != "_self_" and not base.startswith("/"):
-            merged = _merged(merged, shipped_file(group, base))
-    return _merged(merged, own)
-
-
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    both = {
-        key: _merged(below[key], value)
-        for key, value in above.items()
-        if isinstance(value, dict) and isinstance(below.get(key), dict)
-    }
-    return {**below, **above, **both}
+    own = OmegaConf.load(path)
+    # Bases of other groups and of sections, such as cem@stages.search, are not files of this group.
+    bases = [shipped_file(group, base) for base in own.get("defaults", ()) if isinstance(base, str)]
+    merged: Any = OmegaConf.to_container(OmegaConf.merge(*bases, own))
+    return merged
 
 
 def suite_tasks() -> list[str]:
