@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 from importlib import import_module
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 if _IS_COMMAND := (
@@ -57,14 +58,14 @@ TASKS = tuple(suite_tasks())
 """Names of the suite's tasks."""
 
 _PLACES = {
-    "Scene": ("plab.scenes", "Scene"),
-    "Simulator": ("plab.sim", "Simulator"),
-    "build_scene": ("plab.config", "build_scene"),
-    "load_config": ("plab.config", "load_config"),
-    "load_results": ("plab.results", "load"),
-    "make": ("plab.envs", "make"),
-    "make_vec": ("plab.envs", "make_vec"),
-    "make_simulator": ("plab.problem", "make_simulator"),
+    "Scene": "plab.scenes:Scene",
+    "Simulator": "plab.sim:Simulator",
+    "build_scene": "plab.config:build_scene",
+    "load_config": "plab.config:load_config",
+    "load_results": "plab.results:load",
+    "make": "plab.envs:make",
+    "make_vec": "plab.envs:make_vec",
+    "make_simulator": "plab.problem:make_simulator",
 }
 """Module and name of each part that is imported on first use: Taichi and pandas take seconds."""
 
@@ -76,8 +77,7 @@ if not _IS_COMMAND:
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'plab' has no attribute '{name}'")
-    module, attribute = _PLACES[name]
-    return getattr(import_module(module), attribute)
+    return resolve_name(_PLACES[name])
 
 
 def __dir__() -> list[str]:

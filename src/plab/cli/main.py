@@ -18,9 +18,9 @@ Each has its own --help.
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Sequence
+from pkgutil import resolve_name
 
 from plab.errors import PlabError, print_error, suggest
 
@@ -52,5 +52,4 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print_error(f"unknown command {name}; {suggest(name, list(COMMANDS))}")
         return PlabError.exit_code
-    module, _, function = COMMANDS[name].partition(":")
-    return int(getattr(importlib.import_module(module), function)(rest))
+    return int(resolve_name(COMMANDS[name])(rest))
