@@ -91,16 +91,17 @@ def present_value(task: TaskConfig, key: str, path: str) -> Any:
         if rest[1] == "yaw" and group == "bodies":
             return 0.0
     node: Any = task
+    last = key.rpartition(".")[2]
     for name in key.split("."):
         entries = _entries(node)
         if name not in entries:
             raise ConfigError(f"{path}: task.{key} does not exist; {suggest(name, list(entries))}")
         node = entries[name]
-    if node is None and rest[-1:] and rest[-1] in MATERIAL_KEYS:
+    if node is None and last in MATERIAL_KEYS:
         return 0.0
-    fixed = group == "bodies" and rest[-1] in _FIXED
+    fixed = group == "bodies" and last in _FIXED
     if fixed or isinstance(node, bool) or np.asarray(node).dtype.kind not in "iuf":
-        advice = "; use offset" if rest[-1:] == ["center"] else ""
+        advice = "; use offset" if last == "center" else ""
         raise ConfigError(f"{path}: task.{key} cannot be randomised{advice}")
     return node
 
@@ -112,11 +113,11 @@ def _entries(node: Any) -> dict[str, Any]:
 
 def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Values:
     """Sample a value for each range, uniformly per entry."""
-    values: Values = {}
-    for key, (low, high) in bounds.items():
-        unit = rng.random(np.shape(low))
-        values[key] = (np.asarray(low) + unit * (np.asarray(high) - np.asarray(low))).tolist()
-    return values
+    return {key: _uniform(low, high, rng).tolist() for key, (low, high) in bounds.items()}
+
+
+def _uniform(low: Any, high: Any, rng: np.random.Generator) -> Any:
+    return np.asarray(low) + rng.random(np.shape(low)) * np.subtract(high, low)
 
 
 def with_values(cfg: Config, values: Mapping[str, Any]) -> Config:
@@ -198,9 +199,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     except OmegaConfBaseException as error:
         raise ConfigError(f"task.random: {explain(error)}") from None
     random.check("task.random")
-    fixed = OmegaConf.create({})
-    if random.variant is not None:
-        fixed = variant_changes(task, random.variant)
+    fixed = OmegaConf.create({}) if random.variant is None else variant_changes(task, random.variant)
     base = cast(DictConfig, OmegaConf.merge(task, fixed))
     base.variants = base.random = {}  # Values that no attempt changes are not copied.
     if "seed" in base.target.keys():
@@ -229,11 +228,11 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
     """Sample all ranges and the displacement once; return the values in the task's structure."""
     changes = OmegaConf.create({})
     for draw in (random.ranges or {}).values():
-        values = _uniform(draw, rng)
+        values = _rounded(draw, rng)
         for key in draw.keys:
             OmegaConf.update(changes, key, values)
     if random.shift is not None:
-        displacement = _uniform(random.shift, rng)
+        displacement = _rounded(random.shift, rng)
         moving = [name for name, item in base.manipulators.items() if item.scale]
         places = [f"bodies.{name}.center" for name in base.bodies]
         places += [f"manipulators.{name}.position" for name in moving]
@@ -246,10 +245,9 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
     return changes
 
 
-def _uniform(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
-    unit = rng.random(len(bounds.low))
-    drawn = [low + u * (high - low) for low, high, u in zip(bounds.low, bounds.high, unit, strict=True)]
-    return np.clip(np.round(drawn, DECIMALS), bounds.low, bounds.high).tolist()
+def _rounded(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
+    drawn = np.round(_uniform(bounds.low, bounds.high, rng), DECIMALS)
+    return drawn.clip(bounds.low, bounds.high).tolist()
 
 
 def _check(task: TaskConfig, random: RandomConfig) -> None:
