@@ -98,7 +98,6 @@ class ManipulatorConfig(ranges.Section):
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for errors that :meth:`plab.scenes.Scene.validate` does not check."""
         super().check(path)
-        ranges.vector(f"{path}.scale", self.scale, len(self.scale))
         for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
             if not low <= at <= high:
                 raise ConfigError(
@@ -158,9 +157,6 @@ class KinematicsConfig(ranges.Section):
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        for pattern, bounds in self.limits.items():
-            if bounds[0] > bounds[1]:
-                raise ConfigError(f"{path}.limits.{pattern}: low {bounds[0]:g} is above high {bounds[1]:g}")
         if not math.isclose(math.hypot(*self.rotation), 1.0, abs_tol=1e-3):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
