@@ -224,21 +224,18 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     ConfigError if the task is not an unmodified task of the suite, or has no ``random`` section."""
     from plab.config.randomization import with_own_materials
 
-    name, own = cfg.task.name, [f"variant={cfg.variant}"]
-    if cfg.seed_scene is not None:
-        own = ["variant=random", f"seed_scene={cfg.seed_scene}"]
-    ranges = cfg.task.randomize
+    def drawing(variant: str, seed_scene: int | None) -> Config:
+        seed = [] if seed_scene is None else [f"seed_scene={int(seed_scene)}"]
+        one = load_config([f"task={cfg.task.name}", f"variant={variant}", *seed])
+        return with_own_materials(replace(one, task=replace(one.task, randomize=cfg.task.randomize)))
 
-    def drawing(one: Config) -> Config:
-        return with_own_materials(replace(one, task=replace(one.task, randomize=ranges)))
-
-    if drawing(load_config([f"task={name}", *own])).task != with_own_materials(cfg).task:
+    own = drawing(cfg.variant if cfg.seed_scene is None else RANDOM, cfg.seed_scene)
+    if own.task != with_own_materials(cfg).task:
         raise ConfigError(
-            f"random scenes need the task {name} of its file: remove the overrides that change the task, or "
-            "the random scenes"
+            f"random scenes need the task {cfg.task.name} of its file: remove the overrides that change the "
+            "task, or the random scenes"
         )
-    words = [[f"task={name}", "variant=random", f"seed_scene={int(seed)}"] for seed in seeds]
-    drawn = [drawing(load_config(own)) for own in words]
+    drawn = [drawing(RANDOM, seed) for seed in seeds]
     return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
 
 
@@ -292,8 +289,7 @@ def require_runnable(cfg: Config) -> None:
     if cfg.sim.device == "cuda" and not cuda_devices():
         raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
     if cfg.logger != "none" and find_spec(cfg.logger) is None:
-        name = {"tensorboard": "TensorBoard", "wandb": "Weights & Biases"}[cfg.logger]
-        raise ConfigError(f"logger={cfg.logger} needs {name}: pip install 'plab[{cfg.logger}]'")
+        raise ConfigError(f"logger={cfg.logger} needs a package: pip install 'plab[{cfg.logger}]'")
 
 
 # ---------------------------------------------------------------------------------------------------- details

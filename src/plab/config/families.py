@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -117,8 +118,6 @@ def known_family(name: str) -> Family | None:
     """Return the family with a name, or None if its module has not been imported. Reading results does not
     require it, and result files must not trigger imports."""
     if name in FAMILIES or name.partition(":")[0] in sys.modules:
-        try:
+        with suppress(ConfigError):
             return family(name)
-        except ConfigError:
-            return None
     return None
