@@ -12,7 +12,6 @@ import os
 import re
 import signal
 import sys
-import threading
 import traceback
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -54,11 +53,10 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
 
     @functools.wraps(main)
     def answered(argv: Sequence[str] | None = None) -> int:
-        if threading.current_thread() is threading.main_thread():
-            # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
-            if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
-                signal.signal(signal.SIGINT, signal.default_int_handler)
+        # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         _open_output()
         try:
             code = main(list(sys.argv[1:] if argv is None else argv)) or 0
@@ -104,9 +102,7 @@ def prompt_interrupts() -> Iterator[None]:
         print_error("stopped")
         os._exit(EXIT_INTERRUPTED)
 
-    signals = (signal.SIGINT, signal.SIGTERM)
-    main = threading.current_thread() is threading.main_thread()
-    former = [(one, signal.signal(one, leave)) for one in signals if main]
+    former = [(one, signal.signal(one, leave)) for one in (signal.SIGINT, signal.SIGTERM)]
     try:
         yield
     finally:
@@ -213,10 +209,10 @@ def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     return fitting
 
 
-def positive(text: str, least: int = 1) -> int:
+def positive(text: str) -> int:
     """Parse a positive integer."""
-    if not text.isdecimal() or int(text) < least:
-        raise ArgumentTypeError(f"'{text}' must be a whole number of at least {least}")
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentTypeError(f"'{text}' must be a whole number of at least 1")
     return int(text)
 
 

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Dict, Space
 
 from plab.cli.command import (
@@ -129,12 +129,11 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     every = [] if "variant" in given else [f"variant={','.join(SUITE_VARIANTS)}"]
     made = compose_jobs(jobs_of(prepared([*words, *every]), {}, config_dir), config_dir)
     cfgs = [one for one in made if isinstance(one, Config)]
-    for one in made:
+    for one in (one for one in made if not isinstance(one, Config)):
         # Random scenes may not fit into a coarse grid.
-        if not isinstance(one, Config) and cfgs and "variant=random" in one.title.split():
-            print_error(f"{one.title}: left out: {one.message}")
-        elif not isinstance(one, Config):
+        if not cfgs or "variant=random" not in one.title.split():
             raise ArgumentError(one.message)
+        print_error(f"{one.title}: left out: {one.message}")
     require_runnable(cfgs[0])
     if "method" in given:
         return _solved(cfgs, options.together)
@@ -232,20 +231,15 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
             )
 
 
-def _env_spec(
-    cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None
-) -> gymnasium.envs.registration.EnvSpec:
+def _env_spec(cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None) -> EnvSpec:
     """Return the specification of an environment, for minari's ``recover_environment``."""
     words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
     words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
     words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
     variant = cfg.variant if cfg.seed_scene is None else "random"
-    kwargs: dict[str, Any] = {"task": cfg.task.name, "variant": variant, "overrides": words}
-    kwargs["observe"] = observe
+    kwargs = {"task": cfg.task.name, "variant": variant, "overrides": words, "observe": observe}
     if cfg.task.randomize:
         kwargs["randomize"] = cfg.task.randomize
     if cameras is not None:
         kwargs["cameras"] = {name: asdict(camera) for name, camera in cameras.items()}
-    return gymnasium.envs.registration.EnvSpec(
-        id=f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs
-    )
+    return EnvSpec(f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs)

@@ -18,8 +18,6 @@ from plab.config import EXPERIMENT, GROUPS, ConfigError, choices, conf_folder, l
 from plab.config.compose import check_overrides, check_sources, compose_with_hydra, require_runnable
 from plab.config.overrides import parse, prepared
 
-_OF_SWEEPS = re.compile(r"[+]*hydra[./](launcher|sweep)")
-
 
 @command_line
 def main(argv: Sequence[str]) -> int:
@@ -28,7 +26,16 @@ def main(argv: Sequence[str]) -> int:
     Returns:
         Exit code: 0 if all results exist, 1 if a run failed, 2 for invalid input.
     """
-    options = parser().parse_intermixed_args(argv)
+    parser = Parser("plab run", "", add_help=False)
+    add = parser.add_argument
+    add("overrides", nargs="*")
+    add("-h", "--help", action="store_true")
+    add("--help-all", action="store_true")
+    add("-m", "--multirun", action="store_true")
+    add("--cfg", choices=("job", "hydra"))
+    add("--package")
+    add("--config-dir")
+    options = parser.parse_intermixed_args(argv)
     words, config_dir = prepared(options.overrides), options.config_dir
     if options.help or options.help_all:
         check_overrides([], config_dir)
@@ -82,23 +89,9 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     master = compose_with_hydra([str(one.input_line) for one in own], options.config_dir)
     if options.multirun or str(master.hydra.mode).endswith("MULTIRUN"):
         return master
-    if idle := [word for word in words if _OF_SWEEPS.match(word)]:
+    if idle := [word for word in words if re.match(r"[+]*hydra[./](launcher|sweep)", word)]:
         raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or omit it")
     return None
-
-
-def parser() -> Parser:
-    """Return the parser of the arguments."""
-    made = Parser("plab run", "", add_help=False)
-    add = made.add_argument
-    add("overrides", nargs="*")
-    add("-h", "--help", action="store_true")
-    add("--help-all", action="store_true")
-    add("-m", "--multirun", action="store_true")
-    add("--cfg", choices=("job", "hydra"))
-    add("--package")
-    add("--config-dir")
-    return made
 
 
 # ------------------------------------------------------------------------------------------------------- help
