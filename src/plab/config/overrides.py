@@ -20,9 +20,6 @@ from plab.errors import ConfigError, suggest
 RANDOM = "random"
 """Name of the random variant."""
 
-FOLDERS = ("results_dir", "targets.source")
-"""Keys with folder names as values."""
-
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
 """Infinity and NaN in YAML notation."""
 
@@ -40,7 +37,8 @@ def prepared(words: Sequence[str]) -> list[str]:
 def _quote_path(word: str) -> str:
     key, _, text = word.partition("=")
     own = key.lstrip("+")
-    is_path = own in FOLDERS or (own.startswith("task.") and own.endswith(".file"))
+    is_file = own.startswith("task.") and own.endswith(".file")
+    is_path = is_file or own in ("results_dir", "targets.source")
     # Quoted strings, null, interpolations, and multiple values of a sweep are unchanged.
     if not is_path or text == "null" or not text.strip() or re.search(r"[,'\"]|\$\{|^\w+\(", text):
         return word

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from plab.errors import ConfigError
-
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 
@@ -26,18 +24,10 @@ PAPER_SEEDS = ("0", "1", "2")
 
 
 def conf_folder() -> Path:
-    """Return the folder of plab's YAML files: the source tree's ``conf/``, or ``plab/conf`` of a wheel.
-
-    Raises:
-        plab.config.ConfigError: If the installation is incomplete.
-    """
+    """Return the folder of plab's YAML files: the source tree's ``conf/``, or ``plab/conf`` of a wheel."""
     package = Path(__file__).resolve().parents[1]
-    for folder in (package / "conf", package.parents[1] / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise ConfigError(
-        f"no conf/config.yaml next to {package}: the installation is incomplete; install plab again"
-    )
+    installed = package / "conf"
+    return installed if installed.is_dir() else package.parents[1] / "conf"
 
 
 def group_names(group: str) -> list[str]:
