@@ -12,7 +12,7 @@ from plab.errors import ConfigError
 if TYPE_CHECKING:
     from plab.config.compose import *
     from plab.config.run import *
-    from plab.config.suite import conf_folder
+    from plab.config.suite import choices, conf_folder
     from plab.config.task import *
 
 __all__ = [

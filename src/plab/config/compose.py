@@ -8,6 +8,7 @@ task and returns plain dataclasses, independent of Hydra and OmegaConf.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pickle
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -27,10 +28,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import ranges
 from plab.config.families import family
-from plab.config.overrides import COMPOSE_ERRORS, RANDOM, explain, parse, prepared, quoted, variant_changes
+from plab.config.overrides import RANDOM, explained, parse, prepared, quoted, variant_changes
 from plab.config.run import Config
-from plab.config.suite import conf_folder
-from plab.errors import ConfigError, suggest
+from plab.config.suite import choices, conf_folder
+from plab.errors import ConfigError, located, suggest
 from plab.plugins import search_in
 from plab.scenes import MATERIAL_KEYS, Scene, vector3
 from plab.targets import check_target, load_release_target
@@ -73,13 +74,6 @@ OmegaConf.register_new_resolver("by_task", _by_task, replace=True)
 # ------------------------------------------------------------------------------------------------ composition
 
 
-def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the files of a group, such as ``task``, by name, sorted: plab's own files and the user's."""
-    folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir)])]
-    files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
-    return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
-
-
 def load_config(
     overrides: Sequence[str] = (), config_dir: str | Path | None = None, *, alone: bool = False
 ) -> Config:
@@ -102,10 +96,6 @@ def load_config(
     return finish(compose(words, config_dir), words, alone=alone)
 
 
-_KEPT: dict[tuple[Any, ...], bytes] = {}
-"""Cache of composed configurations, by the overrides that select files and the state of the user's files."""
-
-
 def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
     """Return Hydra's composition of prepared overrides, without its own section; raise ConfigError if an
     override or a file is invalid.
@@ -117,38 +107,42 @@ def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictC
     values = [one for one in parsed if _sets_a_value(one)]
     files = [str(one.input_line) for one in parsed if one not in values]
     own = [] if config_dir is None else Path(config_dir).expanduser().glob("*/*.yaml")
-    state = *files, config_dir, *((path, path.stat().st_mtime_ns) for path in own)
-    if state not in _KEPT:
-        _KEPT[state] = pickle.dumps(_without_hydra(compose_with_hydra(files, config_dir)))
-    config: DictConfig = pickle.loads(_KEPT[state])
+    state = config_dir, *((path, path.stat().st_mtime_ns) for path in own)
+    config: DictConfig = pickle.loads(_composed(tuple(files), *state))
     try:
         for override in values:
             OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
     except OmegaConfBaseException:
-        # Hydra reports unknown keys, wrong types and the user's groups.
-        return _without_hydra(compose_with_hydra(words, config_dir))
+        # Hydra reports unknown keys and wrong types, and knows the user's groups.
+        config = pickle.loads(_composed(tuple(words), *state))
     return config
 
 
-def _without_hydra(composed: DictConfig) -> DictConfig:
+@functools.lru_cache(maxsize=1024)
+def _composed(words: tuple[str, ...], config_dir: str | Path | None, *_: tuple[Path, int]) -> bytes:
+    """Return Hydra's composition without its own section, pickled; the state of the user's files, paths and
+    times of modification, is part of the cache's key."""
+    composed = compose_with_hydra(words, config_dir)
     with open_dict(composed):
         del composed["hydra"]
-    return composed
+    return pickle.dumps(composed)
 
 
 def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
     """Return Hydra's composition of prepared overrides, including its own section; see :func:`compose`."""
-    folder = [] if config_dir is None else [f"file://{Path(config_dir).expanduser().resolve()}"]
-    try:
-        return hydra_app().compose_config(
+    overrides = list(words)
+    if config_dir is not None:
+        folder = quoted(f"file://{Path(config_dir).expanduser().resolve()}")
+        overrides.append(f"hydra.searchpath=[{folder}]")
+    with explained():
+        composed = hydra_app().compose_config(
             config_name="config",
-            overrides=[*words, *(f"hydra.searchpath=[{quoted(one)}]" for one in folder)],
+            overrides=overrides,
             run_mode=RunMode.RUN,
             from_shell=False,
             with_log_configuration=False,
         )
-    except COMPOSE_ERRORS as error:
-        raise ConfigError(explain(error)) from None
+    return composed
 
 
 def hydra_app() -> Hydra:
@@ -192,7 +186,7 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
     The chosen variant is merged over the task. The result contains only the chosen variant, because unused
     values are not part of a run's configuration.
     """
-    try:
+    with explained():
         composed.method = _typed_method(composed.method, "method")
         # Hydra closes all dictionaries, but a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
@@ -208,8 +202,6 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
         composed.task.release = {}
         _choose_variant(composed, overrides)
         made = cast(_Composed, OmegaConf.to_object(composed))
-    except OmegaConfBaseException as error:
-        raise ConfigError(explain(error)) from None
     made.check()
     cfg = Config(**vars(made))
     cfg.results_dir = str(Path(cfg.results_dir).expanduser())
@@ -369,7 +361,7 @@ def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
 def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None:
     """Merge the selected variant, sampled if random, into the task, and remove the others."""
     task, name = composed.task, composed.variant
-    if name == RANDOM:
+    if name == RANDOM and task.random:
         from plab.config.randomization import draw_variant
 
         drawn = draw_variant(task, composed.seed_scene)
@@ -380,8 +372,6 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
         _refuse_undone(overrides, variant_changes(task, name), f"variant={name}", f"task.variants.{name}")
         composed.seed_scene = None
     changes = variant_changes(task, composed.variant)
-    try:
+    with located(f"variant {composed.variant} of task {task.name}"), explained():
         task.merge_with(changes)
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"variant {composed.variant} of task {task.name}: {explain(error)}") from None
     task.variants, task.random = {composed.variant: changes}, {}

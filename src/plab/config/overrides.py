@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
@@ -54,10 +55,9 @@ def quoted(text: str) -> str:
 
 def parse(words: Sequence[str]) -> list[Override]:
     """Parse overrides; raise ConfigError if one is invalid."""
-    try:
-        return [_parsed(word) for word in words]
-    except HydraException as error:
-        raise ConfigError(explain(error)) from None
+    with explained():
+        parsed = [_parsed(word) for word in words]
+    return parsed
 
 
 @functools.lru_cache(maxsize=1024)
@@ -67,7 +67,7 @@ def _parsed(word: str) -> Override:
     return override
 
 
-def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
+def swept(override: Override, names: Iterable[str]) -> list[str]:
     """Return the values of an override, such as ``seed=0,1`` or ``task=glob(R*)``, as strings; globs select
     from ``names``. Raise ConfigError if there are no values."""
     value = override.value()
@@ -105,12 +105,18 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
 
 # ---------------------------------------------------------------------------------------------- explanations
 
-COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
-"""Exceptions raised for an invalid configuration."""
+
+@contextmanager
+def explained() -> Iterator[None]:
+    """Convert errors of Hydra, OmegaConf and YAML inside the ``with`` block to ConfigError."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(_explain(error)) from None
 
 
-def explain(error: Exception) -> str:
-    """Return a one-line message, without a full stop, for one of :data:`COMPOSE_ERRORS`."""
+def _explain(error: Exception) -> str:
+    """Return a one-line message, without a full stop."""
     if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|submitit)", str(error)):
         return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
@@ -124,7 +130,7 @@ def explain(error: Exception) -> str:
     cause = _omegaconf_cause(error)
     file = re.match(r"In '(.+)': \w+ raised", str(error))
     if file and cause is not None:
-        return f"{file[1]}.yaml: {explain(cause)}"
+        return f"{file[1]}.yaml: {_explain(cause)}"
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _unknown_key(cause)
     if cause is not None:

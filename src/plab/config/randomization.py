@@ -20,13 +20,12 @@ from typing import Any, cast
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.overrides import explain, variant_changes
+from plab.config.overrides import explained, variant_changes
 from plab.config.run import Config
 from plab.config.selection import leaves
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
-from plab.errors import ConfigError, suggest
+from plab.errors import ConfigError, located, suggest
 from plab.scenes import MATERIAL_KEYS, Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
@@ -185,19 +184,13 @@ _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
-    """Sample the changes of a random variant, in the structure of the entries of ``variants``; raise
-    ConfigError if the task has no ``random`` section, or none of :data:`ATTEMPTS` samples is valid."""
-    if not task.random:
-        raise ConfigError(
-            f"task {task.name} has no section 'random'; choose a variant from: {', '.join(task.variants)}"
-        )
+    """Sample the changes of a random variant, in the structure of the entries of ``variants``, from a task's
+    ``random`` section; raise ConfigError if none of :data:`ATTEMPTS` samples is valid."""
     if seed_scene is None or seed_scene < 0:
         raise ConfigError(f"seed_scene must be an integer of at least 0, not {seed_scene}")
-    try:
+    with located("task.random"), explained():
         merged = OmegaConf.merge(OmegaConf.structured(RandomConfig), task.random)
         random = cast(RandomConfig, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"task.random: {explain(error)}") from None
     random.check("task.random")
     fixed = OmegaConf.create({}) if random.variant is None else variant_changes(task, random.variant)
     base = cast(DictConfig, OmegaConf.merge(task, fixed))

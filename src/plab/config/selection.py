@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from plab.config.suite import SUITE_VARIANTS, group_names
+from plab.config.suite import SUITE_VARIANTS, choices
 from plab.errors import ArgumentError, suggest
 
 OBSERVATION_KEYS = ("observe_particles", "observe_target")
@@ -51,7 +51,7 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
             raise ArgumentError(f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key")
         if override.type is not OverrideType.CHANGE or override.package is not None:
             raise ArgumentError(f"'{word}' selects nothing: write name=value or name=value,value")
-        (chosen.keys if "." in name else chosen.choices)[name] = swept(override, group_names(name))
+        (chosen.keys if "." in name else chosen.choices)[name] = swept(override, choices(name))
     return chosen
 
 
@@ -97,7 +97,7 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
     such as a misspelt task, instead of returning an empty table."""
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
-        known = list(SUITE_VARIANTS) if name == "variant" else group_names(name)
+        known = list(SUITE_VARIANTS) if name == "variant" else list(choices(name))
         for text in texts:
             if text in present or text in known or re.fullmatch(_OPEN.get(name, "(?!)"), text):
                 continue

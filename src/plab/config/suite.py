@@ -30,9 +30,11 @@ def conf_folder() -> Path:
     return installed if installed.is_dir() else package.parents[1] / "conf"
 
 
-def group_names(group: str) -> list[str]:
-    """Return the names of plab's own files in a group, such as ``method``; empty for unknown groups."""
-    return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
+def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
+    """Return the files of a group, such as ``task``, by name, sorted: plab's own files and the user's."""
+    folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir)])]
+    files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
+    return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
 
 
 @functools.cache
@@ -53,4 +55,4 @@ def shipped_file(group: str, name: str) -> Mapping[str, Any]:
 
 def suite_tasks() -> list[str]:
     """Return the names of the suite's tasks: the files in ``conf/task`` except extension tasks."""
-    return [name for name in group_names("task") if name not in EXTENSION_TASKS]
+    return [name for name in choices("task") if name not in EXTENSION_TASKS]

@@ -27,10 +27,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from plab import runners
 from plab.config import Config, ConfigError, build_scene
-from plab.config.compose import check_sources, choices, compose, finish, hydra_app, require_runnable
+from plab.config.compose import check_sources, compose, finish, hydra_app, require_runnable
 from plab.config.families import family
 from plab.config.overrides import parse, swept
 from plab.config.selection import OBSERVATION_KEYS
+from plab.config.suite import choices
 from plab.errors import PlabError, print_error
 from plab.plugins import exported_module_path
 from plab.problem import build_scenes
