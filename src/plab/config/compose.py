@@ -334,9 +334,7 @@ def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: 
                 raise ConfigError(f"'{override.input_line}' has no effect with {choice}")
 
 
-def _refuse_undone(
-    overrides: Sequence[Override], changes: DictConfig, choice: str, place: str = "task.random"
-) -> None:
+def _refuse_undone(overrides: Sequence[Override], changes: DictConfig, choice: str, place: str) -> None:
     """Reject overrides of task keys that ``changes`` overwrite."""
     for override in overrides:
         group, _, key = override.key_or_group.partition(".")
@@ -364,14 +362,12 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     if name == RANDOM and task.random:
         from plab.config.randomization import draw_variant
 
-        drawn = draw_variant(task, composed.seed_scene)
-        _refuse_undone(overrides, drawn, "variant=random")
+        changes, place = draw_variant(task, composed.seed_scene), "task.random"
         composed.variant = f"{RANDOM}{composed.seed_scene}"
-        task.variants = {composed.variant: drawn}
     else:
-        _refuse_undone(overrides, variant_changes(task, name), f"variant={name}", f"task.variants.{name}")
+        changes, place = variant_changes(task, name), f"task.variants.{name}"
         composed.seed_scene = None
-    changes = variant_changes(task, composed.variant)
+    _refuse_undone(overrides, changes, f"variant={name}", place)
     with located(f"variant {composed.variant} of task {task.name}"), explained():
         task.merge_with(changes)
     task.variants, task.random = {composed.variant: changes}, {}
