@@ -237,7 +237,8 @@ def _env_spec(cfg: Config, observe: str | list[str], cameras: Mapping[str, Camer
     words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
     words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
     variant = cfg.variant if cfg.seed_scene is None else "random"
-    kwargs = {"task": cfg.task.name, "variant": variant, "overrides": words, "observe": observe}
+    kwargs: dict[str, Any] = {"task": cfg.task.name, "variant": variant, "overrides": words}
+    kwargs["observe"] = observe
     if cfg.task.randomize:
         kwargs["randomize"] = cfg.task.randomize
     if cameras is not None:

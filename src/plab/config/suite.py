@@ -46,7 +46,7 @@ def shipped_file(group: str, name: str) -> Mapping[str, Any]:
     path = conf_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}
-    own = OmegaConf.load(path)
+    own: Any = OmegaConf.load(path)
     # Bases of other groups and of sections, such as cem@stages.search, are not files of this group.
     bases = [shipped_file(group, base) for base in own.get("defaults", ()) if isinstance(base, str)]
     merged: Any = OmegaConf.to_container(OmegaConf.merge(*bases, own))
