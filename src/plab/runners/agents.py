@@ -303,22 +303,20 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return torch.baddbmm(bias.unsqueeze(1), x, weight)
 
 
-def mlp(x: Tensor, part: Part, name: str, activation: Callable[[Tensor], Tensor], *, last: bool) -> Tensor:
-    """Evaluate a stacked ``nn.Sequential`` of linear layers for x of shape [stack, row, in]. ``name`` is its
-    name in the part, or empty if it is the whole part. An activation follows each layer, except the last
-    one unless ``last``."""
-    prefix = f"{name}." if name else ""
-    numbers = [int(n[len(prefix) : -len(".weight")]) for n in part if n.startswith(prefix) and "weight" in n]
-    for number in sorted(numbers):
-        x = linear(x, part[f"{prefix}{number}.weight"], part[f"{prefix}{number}.bias"])
-        x = x if last and number == max(numbers) else activation(x)
+def mlp(x: Tensor, part: Part, activation: Callable[[Tensor], Tensor], *, linear_last: bool) -> Tensor:
+    """Evaluate a stacked ``nn.Sequential`` of linear layers for x of shape [stack, row, in]. An activation
+    follows each layer, except the last one if ``linear_last``."""
+    tensors = list(part.values())
+    for k in range(0, len(tensors), 2):
+        x = linear(x, *tensors[k : k + 2])
+        x = x if linear_last and k + 2 == len(tensors) else activation(x)
     return x
 
 
 def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
     """Return the values of two stacked critics, shape [agent, 2, row]."""
     pairs = torch.cat([observations, actions], dim=2).repeat_interleave(2, dim=0)
-    return mlp(pairs, part, "", torch.relu, last=True).view(len(observations), 2, -1)
+    return mlp(pairs, part, torch.relu, linear_last=True).view(len(observations), 2, -1)
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:

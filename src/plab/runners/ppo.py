@@ -267,11 +267,12 @@ class PpoAgents(Agents):
     def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean actions, shape [agent, row, action], and values, shape [agent, row]."""
         pairs = observations.repeat_interleave(2, dim=0)
-        latent = mlp(pairs, self.networks["hidden"], "", torch.tanh, last=False)
+        latent = mlp(pairs, self.networks["hidden"], torch.tanh, linear_last=False)
         latent = latent.view(self.count, 2, *latent.shape[1:])
-        mean, value = self.networks["mean"], self.networks["value"]
-        values = linear(latent[:, 1], value["weight"], value["bias"])
-        return linear(latent[:, 0], mean["weight"], mean["bias"]), values.squeeze(2)
+        mean, values = (
+            linear(latent[:, k], *self.networks[part].values()) for k, part in enumerate(("mean", "value"))
+        )
+        return mean, values.squeeze(2)
 
     def _values(self, observations: Tensor) -> Tensor:
         with torch.no_grad():

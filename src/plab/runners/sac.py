@@ -41,7 +41,9 @@ class SacAgents(OffPolicyAgents):
     """Soft actor-critic agents; targets are updated at every step."""
 
     PARTS: ClassVar = {
-        "actor": ("actor",),
+        "actor": ("actor.latent_pi",),
+        "mean": ("actor.mu",),
+        "log_std": ("actor.log_std",),
         "critics": ("critic.qf0", "critic.qf1"),
         "targets": ("critic_target.qf0", "critic_target.qf1"),
     }
@@ -52,7 +54,11 @@ class SacAgents(OffPolicyAgents):
         super().__init__(cfgs, spaces, device)
         self.log_ent_coef = torch.zeros(self.count, device=device, requires_grad=True)
         self.tensors["log_ent_coef"] = self.log_ent_coef
-        own = {"entropy": [self.log_ent_coef]} | {n: self.parameters(n) for n in ("critics", "actor")}
+        own = {
+            "entropy": [self.log_ent_coef],
+            "critics": self.parameters("critics"),
+            "actor": self.parameters("actor", "mean", "log_std"),
+        }
         self.optimizers = {name: adam(part, self.method.lr) for name, part in own.items()}
 
     @staticmethod
@@ -114,11 +120,8 @@ class SacAgents(OffPolicyAgents):
 
     def _gaussian(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean and log standard deviation of actions before tanh."""
-        actor = self.networks["actor"]
-        latent = mlp(observations, actor, "latent_pi", torch.relu, last=False)
-        mean, log_std = (
-            linear(latent, actor[f"{name}.weight"], actor[f"{name}.bias"]) for name in ("mu", "log_std")
-        )
+        latent = mlp(observations, self.networks["actor"], torch.relu, linear_last=False)
+        mean, log_std = (linear(latent, *self.networks[part].values()) for part in ("mean", "log_std"))
         return mean, log_std.clamp(*LOG_STD)
 
     def _drawn(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

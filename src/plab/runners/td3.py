@@ -121,7 +121,7 @@ class Td3Agents(OffPolicyAgents):
         return loss.detach()
 
     def _actor(self, part: str, observations: Tensor) -> Tensor:
-        return torch.tanh(mlp(observations, self.networks[part], "", torch.relu, last=True))
+        return torch.tanh(mlp(observations, self.networks[part], torch.relu, linear_last=True))
 
     def _noisy(self, actions: Tensor, noise: Tensor) -> Tensor:
         return (actions + noise * self.method.exploration_noise).clamp(-1.0, 1.0)
