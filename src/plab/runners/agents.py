@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
@@ -136,14 +137,10 @@ class Sizes(NamedTuple):
         """Number of float32 values of one episode in all N environments."""
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
-    def window(self, buffer_size: int) -> int:
-        """Return how many steps of N environments can be sampled after a number of transitions."""
-        return max(buffer_size // self.envs, 1)
-
     def capacity(self, buffer_size: int, total_steps: int) -> int:
         """Return how many episodes of N environments a buffer for a number of transitions holds."""
         # One more, because the oldest samples may begin, and the latest end, within an episode.
-        held = math.ceil(self.window(buffer_size) / self.horizon) + 1
+        held = math.ceil(buffer_size // self.envs / self.horizon) + 1
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
 
 
@@ -168,7 +165,7 @@ class ReplayBuffer:
     ) -> None:
         """Allocate buffers for the latest transitions, given the number of training transitions."""
         self.added = 0
-        self._sizes, self._window = sizes, sizes.window(buffer_size)
+        self._sizes, self._window = sizes, buffer_size // sizes.envs
         self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
         n, horizon = sizes.envs, sizes.horizon
         shape = agents, capacity
@@ -433,7 +430,7 @@ class Agents:
         self.random = AgentRandom([cfg.seed for cfg in cfgs], device)
         self.networks = stacked(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
-        self._updates: dict[str, CapturedUpdate] = {}
+        self._updates: dict[Hashable, CapturedUpdate] = {}
         self._losses: dict[str, list[Tensor]] = {}
 
     @staticmethod
@@ -484,9 +481,8 @@ class Agents:
         tables = {"networks": self.parameters()}
         tables |= {name: [tensor] for name, tensor in self.tensors.items()}
         for name, optimizer in self.optimizers.items():
-            kept = [optimizer.state[p] for p in optimizer.param_groups[0]["params"]]
             for moment in ("exp_avg", "exp_avg_sq"):
-                tables[f"{name}_{moment}"] = [own[moment] for own in kept]
+                tables[f"{name}_{moment}"] = [own[moment] for own in optimizer.state.values()]
         return tables
 
     def states(self) -> list[dict[str, Any]]:
@@ -494,7 +490,7 @@ class Agents:
         rows = {name: flat(tensors, self.count).cpu().numpy() for name, tensors in self._tables().items()}
         shared = {"steps": self.steps, "updates": self.updates}
         for name, optimizer in self.optimizers.items():
-            shared[f"{name}_steps"] = int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
+            shared[f"{name}_steps"] = int(next(iter(optimizer.state.values()))["step"])
         return [
             {**shared, **{name: table[k].copy() for name, table in rows.items()}, "random": random}
             for k, random in enumerate(self.random.states())
@@ -510,8 +506,8 @@ class Agents:
                 part.copy_(known)
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
         for name, optimizer in self.optimizers.items():
-            for parameter in optimizer.param_groups[0]["params"]:
-                optimizer.state[parameter]["step"].fill_(int(state[f"{name}_steps"]))
+            for kept in optimizer.state.values():
+                kept["step"].fill_(int(state[f"{name}_steps"]))
         self.random.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
@@ -526,9 +522,11 @@ class Agents:
             for name, row in zip(self.LOSSES, losses, strict=False):
                 self._losses.setdefault(name, []).append(row.clone())
 
-    def _captured(self, update: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Call a function that is captured as a CUDA graph; the next call overwrites its results."""
-        return self._updates.setdefault(update.__name__, CapturedUpdate(update))(*arguments)
+    def _captured(self, update: Callable[..., Tensor], *arguments: Tensor, **options: bool) -> Tensor:
+        """Call a function that is captured as a CUDA graph for each value of its options; the next call
+        overwrites its results."""
+        key = update.__name__, *options.items()
+        return self._updates.setdefault(key, CapturedUpdate(partial(update, **options)))(*arguments)
 
 
 class OffPolicyAgents(Agents):

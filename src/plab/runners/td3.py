@@ -11,7 +11,6 @@ from plab.plugins import torch
 from plab.runners.agents import (
     OffPolicyAgents,
     OffPolicyConfig,
-    Samples,
     adam,
     descend,
     follow,
@@ -81,44 +80,35 @@ class Td3Agents(OffPolicyAgents):
             return self._actor("actor", observations)
 
     def update(self) -> None:
-        """Update the critics, and the actor if it is due."""
-        delayed = self.updates % self.method.policy_delay != 0
-        update, numbers = self.critics if delayed else self.both, self.numbers()
-        shape = self.method.batch_size, self.sizes.actions
+        """Update the critics, and actor and targets if they are due."""
+        due = self.updates % self.method.policy_delay == 0
+        numbers, shape = self.numbers(), (self.method.batch_size, self.sizes.actions)
         noise = self.random.block("smoothing", "normal", *shape)
-        self._note(self._captured(update, numbers, noise))
+        self._note(self._captured(self.descent, numbers, noise, due=due))
 
-    def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update the critics from sampled transitions, and return their losses, shape [1, agent]. ``numbers``
+    def descent(self, numbers: Tensor, noise: Tensor, *, due: bool) -> Tensor:
+        """Update the critics from sampled transitions, and actor and targets if they are ``due``. ``numbers``
         are the integers of :meth:`plab.runners.agents.ReplayBuffer.sample`; the noise of the target policy is
-        standard normal, shape [agent, row, action]."""
-        return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
-
-    def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update critics, actor and targets, as :meth:`critics`; return losses, shape [2, agent]."""
-        samples = self.replay.sample(numbers)
-        critic_loss = self._update_critics(samples, noise)
-        actions = self._actor("actor", samples.observations)
-        actor_loss = -twin_values(self.networks["critics"], samples.observations, actions)[:, 0].mean(1)
-        descend(self.optimizers["actor"], actor_loss)
-        parameters = self.parameters
-        for target, source in (("targets", "critics"), ("actor_target", "actor")):
-            follow(parameters(target), parameters(source), self.method.tau)
-        return torch.stack([critic_loss, actor_loss.detach()])
-
-    def _update_critics(self, samples: Samples, noise: Tensor) -> Tensor:
-        reach = self.method.target_noise_clip
+        standard normal, shape [agent, row, action]. Return the losses of critics and, if due, actor, shape
+        [1 or 2, agent]."""
+        networks, parameters, reach = self.networks, self.parameters, self.method.target_noise_clip
+        observations, actions, next_observations, rewards = self.replay.sample(numbers)
         with torch.no_grad():
             smoothing = (noise * self.method.target_noise).clamp(-reach, reach)
-            next_actions = self._actor("actor_target", samples.next_observations) + smoothing
-            next_actions = next_actions.clamp(-1.0, 1.0)
-            values = twin_values(self.networks["targets"], samples.next_observations, next_actions)
+            next_actions = self._actor("actor_target", next_observations) + smoothing
+            values = twin_values(networks["targets"], next_observations, next_actions.clamp(-1.0, 1.0))
             # An episode ends by truncation only: the value of the next observation always counts.
-            targets = samples.rewards + self.method.gamma * values.min(1).values
-        judged = twin_values(self.networks["critics"], samples.observations, samples.actions)
-        loss = (judged - targets.unsqueeze(1)).square().mean(2).sum(1)
-        descend(self.optimizers["critics"], loss)
-        return loss.detach()
+            targets = rewards + self.method.gamma * values.min(1).values
+        errors = twin_values(networks["critics"], observations, actions) - targets.unsqueeze(1)
+        losses = [errors.square().mean(2).sum(1)]
+        descend(self.optimizers["critics"], losses[0])
+        if due:
+            own_actions = self._actor("actor", observations)
+            losses.append(-twin_values(networks["critics"], observations, own_actions)[:, 0].mean(1))
+            descend(self.optimizers["actor"], losses[1])
+            for target, source in (("targets", "critics"), ("actor_target", "actor")):
+                follow(parameters(target), parameters(source), self.method.tau)
+        return torch.stack([loss.detach() for loss in losses])
 
     def _actor(self, part: str, observations: Tensor) -> Tensor:
         return torch.tanh(mlp(observations, self.networks[part], torch.relu, linear_last=True))
