@@ -72,7 +72,7 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
     words = ["task=Move", f"sim.horizon={HORIZON}", f"method.num_envs={ENVS}", "method.episodes=16"]
     words += ["method.hidden=[8,8]", *LEARNERS[name]]
     cfgs = [load_config([*words, f"seed={seed}"]) for seed in range(3)]
-    return agents_of(cfgs[0].method)(cfgs, SPACES, torch.device(device)), cfgs
+    return agents_of(cfgs[0].method)(cfgs, SPACES, torch.device(device), STEPS * ENVS), cfgs
 
 
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:

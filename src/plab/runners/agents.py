@@ -23,7 +23,6 @@ from plab.config import Config, ranges
 from plab.plugins import torch
 from plab.results import ResultsError
 from plab.runners.policy import Moments, PolicyConfig, Spaces, first_policy
-from plab.runners.training import whole_cycles
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -406,7 +405,6 @@ class Agents:
         networks: Parameters by part.
         optimizers: Adam optimisers of parts of the networks, by name.
         tensors: Additional tensors of a checkpoint, by name, each of shape [agent, ...].
-        watched: Whether losses are recorded for :meth:`take_losses`.
     """
 
     PARTS: ClassVar[Mapping[str, Sequence[str]]]
@@ -416,22 +414,27 @@ class Agents:
     """Names of the losses returned by an update, as in Stable-Baselines3's logs."""
 
     optimizers: dict[str, Adam]
-    watched = False
 
-    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Initialise untrained networks for configurations with equal ``method`` sections, one per agent."""
+    def __init__(
+        self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device, total_steps: int
+    ) -> None:
+        """Initialise untrained networks for configurations with equal ``method`` sections, one per agent, and
+        a total number of transitions."""
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
-        horizon = cfgs[0].sim.horizon
-        first = [first_policy(cfg.method_as(RlConfig), spaces, cfg.seed) for cfg in cfgs]
-        self.sizes, self._spaces = Sizes(self.method.num_envs, horizon, *spaces.sizes), spaces
-        cycle = self.cycle_steps(self.method, horizon)
-        self.total_steps = whole_cycles(self.method.episodes * horizon, cycle)
+        first = [first_policy(self.method, spaces, cfg.seed) for cfg in cfgs]
+        self.sizes = Sizes(self.method.num_envs, cfgs[0].sim.horizon, *spaces.sizes)
+        self.total_steps, self._spaces = total_steps, spaces
         self.steps = self.updates = 0
         self.random = AgentRandom([cfg.seed for cfg in cfgs], device)
         self.networks = stacked(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._updates: dict[Hashable, CapturedUpdate] = {}
         self._losses: dict[str, list[Tensor]] = {}
+        self.build()
+
+    @abstractmethod
+    def build(self) -> None:
+        """Create optimisers, buffers and additional tensors."""
 
     @staticmethod
     @abstractmethod
@@ -518,9 +521,8 @@ class Agents:
 
     def _note(self, losses: Tensor) -> None:
         """Record the losses of an update, shape [loss, agent]; the last of :attr:`LOSSES` may be missing."""
-        if self.watched:
-            for name, row in zip(self.LOSSES, losses, strict=False):
-                self._losses.setdefault(name, []).append(row.clone())
+        for name, row in zip(self.LOSSES, losses.clone(), strict=False):
+            self._losses.setdefault(name, []).append(row)
 
     def _captured(self, update: Callable[..., Tensor], *arguments: Tensor, **options: bool) -> Tensor:
         """Call a function that is captured as a CUDA graph for each value of its options; the next call
@@ -534,10 +536,9 @@ class OffPolicyAgents(Agents):
 
     method: OffPolicyConfig
 
-    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        super().__init__(cfgs, spaces, device)
+    def build(self) -> None:
         size = self.method.buffer_size
-        self.replay = ReplayBuffer(self.count, self.sizes, size, self.total_steps, device)
+        self.replay = ReplayBuffer(self.count, self.sizes, size, self.total_steps, self.device)
 
     @abstractmethod
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, cast
 
-from plab.config import Config, ConfigError, ranges
+from plab.config import ConfigError, ranges
 from plab.plugins import torch
 from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp
 from plab.runners.policy import CLIP, EPSILON, Moments, Spaces, set_rate
@@ -112,9 +112,8 @@ class PpoAgents(Agents):
 
     method: PpoConfig
 
-    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        super().__init__(cfgs, spaces, device)
-        agents, envs = self.count, self.sizes.envs
+    def build(self) -> None:
+        agents, envs, device = self.count, self.sizes.envs, self.device
         self._size = self.cycle_steps(self.method, self.sizes.horizon)
         self._length = self._size // envs
         few = self.method.statistics_episodes
@@ -131,10 +130,10 @@ class PpoAgents(Agents):
         parameters = self.parameters()
         self.optimizers = {"policy": adam(parameters, self.method.lr, eps=self.method.adam_eps)}
         rollout = agents, envs, self._length
-        self.observations = torch.zeros((*rollout, self.sizes.observed), device=device)
-        self.actions = torch.zeros((*rollout, self.sizes.actions), device=device)
-        names = ("values", "log_probs", "rewards", "advantages", "returns")
-        self.rollout = {name: torch.zeros(rollout, device=device) for name in names}
+        shapes = {"observations": (*rollout, self.sizes.observed), "actions": (*rollout, self.sizes.actions)}
+        shapes |= dict.fromkeys(("values", "log_probs", "advantages", "returns"), rollout)
+        self.rollout = {name: torch.zeros(shape, device=device) for name, shape in shapes.items()}
+        self.rewards = torch.zeros(rollout, device=device)
         self._over: list[bool] = []
 
     @staticmethod
@@ -167,16 +166,15 @@ class PpoAgents(Agents):
 
     def act(self, observations: Tensor) -> Tensor:
         """Sample actions, which may be outside [-1, 1]; environments clip them."""
-        step = len(self._over)
-        seen = self.scaled(observations)
+        step, rollout, seen = len(self._over), self.rollout, self.scaled(observations)
         with torch.no_grad():
             mean, values = self._evaluate(seen)
             std = self.networks["log_std"][""].exp().unsqueeze(1)
             noise = self.random.block("noise", "normal", self.sizes.envs, self.sizes.actions)
             actions = mean + std * noise
-            self.observations[:, :, step], self.actions[:, :, step] = seen, actions
-            self.rollout["values"][:, :, step] = values
-            self.rollout["log_probs"][:, :, step] = self._log_prob(mean, actions)
+            rollout["observations"][:, :, step], rollout["actions"][:, :, step] = seen, actions
+            rollout["values"][:, :, step] = values
+            rollout["log_probs"][:, :, step] = self._log_prob(mean, actions)
         return actions
 
     def decide(self, observations: Tensor) -> Tensor:
@@ -196,7 +194,7 @@ class PpoAgents(Agents):
             if self.method.bootstrap:
                 rewards = rewards + self.method.gamma * self._values(last)
             self._returns.zero_()
-        self.rollout["rewards"][:, :, len(self._over)] = rewards
+        self.rewards[:, :, len(self._over)] = rewards
         self._over.append(over)
         if len(self._over) == self._length:
             if self.method.lr_decay:
@@ -225,7 +223,7 @@ class PpoAgents(Agents):
         goes_on = 1.0 - torch.tensor(over, dtype=torch.float32, device=self.device)
         values = table["values"]
         after = torch.cat([values[:, :, 1:], last_values.unsqueeze(2)], dim=2)
-        gains = (table["rewards"] + gamma * after * goes_on - values).unbind(2)
+        gains = (self.rewards + gamma * after * goes_on - values).unbind(2)
         advantage = torch.zeros_like(last_values)
         advantages = []
         for gain, ended in zip(reversed(gains), reversed(over), strict=True):
@@ -239,13 +237,9 @@ class PpoAgents(Agents):
         shape [agent, row]; return the losses of policy, value and entropy, shape [3, agent]."""
         m = self.method
         where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
-        observations, actions = (
-            table.view(-1, table.shape[-1]).index_select(0, where).view(*numbers.shape, -1)
-            for table in (self.observations, self.actions)
-        )
-        old_values, old_log_prob, advantages, returns = (
-            self.rollout[name].view(-1).index_select(0, where).view(numbers.shape)
-            for name in ("values", "log_probs", "advantages", "returns")
+        observations, actions, old_values, old_log_prob, advantages, returns = (
+            table.flatten(0, 2).index_select(0, where).unflatten(0, numbers.shape)
+            for table in self.rollout.values()
         )
         if numbers.shape[1] > 1:
             spread = advantages.std(1, keepdim=True)

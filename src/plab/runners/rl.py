@@ -70,7 +70,7 @@ class RlRunner(PolicyRunner):
                 )
         size = len(cfgs) if cuda else 1
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
-        self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
+        self.stacks: list[Agents] = [kind(part, spaces, self._device, self.total_steps) for part in parts]
         self._places = [(stack, number) for stack in self.stacks for number in range(stack.count)]
         self._reward = torch.zeros((len(cfgs), self._envs), dtype=torch.float64, device=self._device)
         self._observations: Any = None
@@ -130,8 +130,6 @@ class RlRunner(PolicyRunner):
 
     def _first_observations(self) -> Tensor:
         """Begin the first episodes, or replay those of the checkpoint; return the observations."""
-        for stack in self.stacks:
-            stack.watched = self.watched
         observations = self._own(self._env.reset(episode=self.episodes // self._envs), self._envs)
         if self.steps == 0:
             for stack, part in zip(self.stacks, self._split(observations), strict=True):

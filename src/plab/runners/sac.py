@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from plab.config import Config
 from plab.plugins import torch
 from plab.runners.agents import (
     OffPolicyAgents,
@@ -50,9 +48,9 @@ class SacAgents(OffPolicyAgents):
 
     LOSSES: ClassVar = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 
-    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        super().__init__(cfgs, spaces, device)
-        self.log_ent_coef = torch.zeros(self.count, device=device, requires_grad=True)
+    def build(self) -> None:
+        super().build()
+        self.log_ent_coef = torch.zeros(self.count, device=self.device, requires_grad=True)
         self.tensors["log_ent_coef"] = self.log_ent_coef
         own = {
             "entropy": [self.log_ent_coef],

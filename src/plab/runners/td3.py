@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from plab.config import Config, ranges
+from plab.config import ranges
 from plab.plugins import torch
 from plab.runners.agents import (
     OffPolicyAgents,
@@ -55,8 +54,8 @@ class Td3Agents(OffPolicyAgents):
 
     method: Td3Config
 
-    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        super().__init__(cfgs, spaces, device)
+    def build(self) -> None:
+        super().build()
         self.optimizers = {part: adam(self.parameters(part), self.method.lr) for part in ("critics", "actor")}
 
     @staticmethod

@@ -149,11 +149,6 @@ class TrainingSummary:
     losses: Mapping[str, float] = field(default_factory=dict)
 
 
-def whole_cycles(steps: int, cycle: int) -> int:
-    """Round transitions up to whole cycles."""
-    return math.ceil(steps / cycle) * cycle
-
-
 class PolicyRunner(Runner, ABC):
     """Base class of runners that train policies in lockstep; each iteration consists of some training
     episodes and one evaluation episode per policy.
@@ -164,7 +159,6 @@ class PolicyRunner(Runner, ABC):
     Attributes:
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
-        watched: Whether losses of the updates are recorded.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
@@ -173,7 +167,7 @@ class PolicyRunner(Runner, ABC):
     round_episodes: tuple[int, int] = 1, 0
     """Episodes per environment in a cycle, and episodes with gradient."""
 
-    simulates, tf32, watched = True, False, False
+    simulates, tf32 = True, False
 
     # ------------------------------------------------------------------------------------------------ hooks
 
@@ -223,9 +217,10 @@ class PolicyRunner(Runner, ABC):
     # ------------------------------------------------------------------------------- shared implementation
 
     def set_cycle(self, batch: EpisodeBatch, cycle: int) -> None:
-        """Plan ``method.episodes`` episodes, given the number of transitions per cycle and policy."""
+        """Plan ``method.episodes`` episodes, rounded up to whole cycles, given the number of transitions per
+        cycle and policy."""
         self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
-        self.total_steps = whole_cycles(self.method.episodes * self._horizon, cycle)
+        self.total_steps = math.ceil(self.method.episodes * self._horizon / cycle) * cycle
 
     @property
     def episodes(self) -> int:
@@ -255,7 +250,6 @@ class PolicyRunner(Runner, ABC):
         kinds = [(training, self.method.contact)] if training else []
         *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))
         self._judge, self.problem = TensorEnv(judge), judge.problem
-        self.watched = any(track.log.wanted for track in self.tracks)
         self.prepare(*own or [judge])
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
