@@ -233,7 +233,7 @@ def test_agents_learn_what_stable_baselines3_learns(name: str, monkeypatch) -> N
                 if hasattr(model.learning_rate, "remaining"):
                     model.learning_rate.remaining = 1.0 - done / agents.total_steps
                 model.learn(cycle, reset_num_timesteps=False)
-        own, _ = agents.policy(agent)
+        own = agents.policy(agent).network
         for (key, expected), found in zip(model.policy.named_parameters(), own.parameters(), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-4, atol=2e-6, msg=key)
         if name == "sac":

@@ -26,7 +26,7 @@ from plab.cli import status
 from plab.config import build_scene, load_config
 from plab.config.families import FAMILIES
 from plab.results import ResultsError, check, read, unpack
-from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, save_policy
+from plab.runners.policy import Policy, Spaces, first_policy, load_policy, policy_path, save_policy
 from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target
 
@@ -83,9 +83,9 @@ def make_policy(folder: Path) -> Path:
     method = load_config(["task=Move", "method=ppo", "method.hidden=[4]"]).method
     bounds = np.arange(5, dtype=np.float32)
     spaces = Spaces(Box(-bounds, bounds), Box(-1.0, 1.0, (3,), np.float32))
-    policy = first_policy(method, spaces)
+    policy = Policy(first_policy(method, spaces), np.zeros(5), np.ones(5))
     folder.mkdir(parents=True)
-    save_policy(folder / "run.h5", method, policy, (np.zeros(5), np.ones(5)))
+    save_policy(folder / "run.h5", method, policy)
     return policy_path(folder / "run.h5")
 
 

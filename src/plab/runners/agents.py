@@ -22,7 +22,7 @@ import numpy as np
 from plab.config import Config, ranges
 from plab.plugins import torch
 from plab.results import ResultsError
-from plab.runners.policy import Moments, PolicyConfig, Spaces, first_policy
+from plab.runners.policy import Policy, PolicyConfig, Spaces, first_policy
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -441,17 +441,17 @@ class Agents:
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
         """Return Stable-Baselines3's policy with initial weights, on the CPU."""
 
-    def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
-        """Return Stable-Baselines3's policy with an agent's networks and observation scaling, if any."""
-        policy: Any = first_policy(self.method, self._spaces)
-        own = dict(policy.named_parameters())
+    def policy(self, agent: int) -> Policy:
+        """Return the policy of an agent."""
+        network = first_policy(self.method, self._spaces)
+        own = dict(network.named_parameters())
         with torch.no_grad():
             for part, modules in self.PARTS.items():
                 for name, tensor in self.networks[part].items():
                     rows = tensor.reshape(self.count, len(modules), *tensor.shape[1:])[agent]
                     for module, row in zip(modules, rows, strict=True):
                         own[f"{module}.{name}".rstrip(".")].copy_(_transposed(row))
-        return policy, None
+        return Policy(network)
 
     def parameters(self, *parts: str) -> list[Tensor]:
         """Return the stacked parameters of the named parts, or of all parts."""
@@ -514,8 +514,8 @@ class Agents:
         self.random.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
-        """Return each agent's mean losses since the last call, by name."""
-        means = {name: torch.stack(rows).mean(0).tolist() for name, rows in self._losses.items()}
+        """Return each agent's mean losses since the last call, by name in a log."""
+        means = {f"train/{name}": torch.stack(rows).mean(0).tolist() for name, rows in self._losses.items()}
         self._losses = {}
         return [{name: row[agent] for name, row in means.items()} for agent in range(self.count)]
 

@@ -79,7 +79,6 @@ class BcRunner(ImitationRunner):
     """Runner of a policy trained on a dataset; a cycle is one pass."""
 
     columns = ("imitation_error",)
-    simulates = False
 
     def prepare(self, batch: EpisodeBatch) -> None:
         """Load the observations and actions of the dataset."""

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -42,9 +42,6 @@ CLIP = 10.0
 
 EPSILON = 1e-8
 """Added to variances of observations, as in Stable-Baselines3."""
-
-Moments: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Means and variances of observations, shape [entry] each, by which they are scaled."""
 
 _FORMAT = "plab-policy 1"
 
@@ -141,22 +138,24 @@ def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePol
         return rule.make_policy(method, spaces)
 
 
+@dataclass
 class Policy:
     """A trained, deterministic policy.
 
     Attributes:
-        network: Stable-Baselines3's policy with the scaling of observations used in training.
+        network: Stable-Baselines3's policy.
+        mean: Means of the observations, shape [entry], by which they are scaled; None without scaling.
+        variance: Variances of the observations, likewise.
     """
 
-    def __init__(self, network: BasePolicy, mean: np.ndarray | None, variance: np.ndarray | None) -> None:
-        """Wrap a network; means and variances, shape [entry], scale the observations, unless None."""
-        self.network = network
-        self._mean, self._variance = mean, variance
+    network: BasePolicy
+    mean: np.ndarray | None = None
+    variance: np.ndarray | None = None
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions, shape [env, action], for observations from environments, shape [env, entry]."""
-        if self._mean is not None and self._variance is not None:
-            scaled = (observation - self._mean) / np.sqrt(self._variance + EPSILON)
+        if self.mean is not None and self.variance is not None:
+            scaled = (observation - self.mean) / np.sqrt(self.variance + EPSILON)
             observation = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
         return self.network.predict(observation, deterministic=True)[0]
 
@@ -166,18 +165,17 @@ def policy_path(result: Path) -> Path:
     return result.with_suffix(".policy.npz")
 
 
-def save_policy(
-    result: Path, method: PolicyConfig, policy: BasePolicy, moments: Moments | None = None
-) -> None:
-    """Write the policy file of a result, with the ``method`` section of its configuration and the moments
-    that scale observations, if any; raise ResultsError on failure."""
+def save_policy(result: Path, method: PolicyConfig, policy: Policy) -> None:
+    """Write the policy file of a result, with the ``method`` section of its configuration; raise ResultsError
+    on failure."""
     arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
-        space = cast("Box", getattr(policy, f"{name}_space"))
+        space = cast("Box", getattr(policy.network, f"{name}_space"))
         arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
-    if moments is not None:
-        arrays |= {"mean": np.asarray(moments[0]), "variance": np.asarray(moments[1])}
-    arrays |= {f"{_PARAMETER}{name}": values.cpu().numpy() for name, values in policy.state_dict().items()}
+    if policy.mean is not None:
+        arrays |= {"mean": policy.mean, "variance": policy.variance}
+    parameters = policy.network.state_dict()
+    arrays |= {f"{_PARAMETER}{name}": values.cpu().numpy() for name, values in parameters.items()}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     replace_file(policy_path(result), buffer.getvalue(), sync=True)

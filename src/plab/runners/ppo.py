@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, ClassVar, cast
 from plab.config import ConfigError, ranges
 from plab.plugins import torch
 from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp
-from plab.runners.policy import CLIP, EPSILON, Moments, Spaces, set_rate
+from plab.runners.policy import CLIP, EPSILON, Policy, Spaces, set_rate
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+    from stable_baselines3.common.policies import ActorCriticPolicy
     from torch import Tensor
 
 ACTION_GAIN = 0.01
@@ -149,10 +149,12 @@ class PpoAgents(Agents):
             cast("torch.nn.Linear", layer).weight.data.mul_(gain)
         return policy
 
-    def policy(self, agent: int) -> tuple[BasePolicy, Moments | None]:
-        policy, _ = super().policy(agent)
-        moments = self._seen.mean[agent].cpu().numpy(), self._seen.var[agent].cpu().numpy()
-        return policy, moments if self.method.normalise else None
+    def policy(self, agent: int) -> Policy:
+        policy = super().policy(agent)
+        if self.method.normalise:
+            policy.mean = self._seen.mean[agent].cpu().numpy()
+            policy.variance = self._seen.var[agent].cpu().numpy()
+        return policy
 
     @classmethod
     def cycle_steps(cls, method: PpoConfig, horizon: int) -> int:

@@ -17,15 +17,14 @@ import numpy as np
 from plab.config.families import RL, Appearance, Family, Rule, family
 from plab.plugins import torch
 from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, ReplayBuffer, RlConfig, Sizes
-from plab.runners.policy import Moments, Spaces
+from plab.runners.policy import Policy, Spaces
 from plab.runners.ppo import PpoAgents, PpoConfig
 from plab.runners.runner import RunError
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
-from plab.runners.training import PolicyRunner, TrainingSummary
+from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import BasePolicy
     from torch import Tensor
 
     from plab.envs.core import EpisodeBatch, Transition
@@ -74,8 +73,6 @@ class RlRunner(PolicyRunner):
         self._places = [(stack, number) for stack in self.stacks for number in range(stack.count)]
         self._reward = torch.zeros((len(cfgs), self._envs), dtype=torch.float64, device=self._device)
         self._observations: Any = None
-        self._broken: dict[int, list[str]] = {}
-        self._ended: list[Tensor] = []
         # Actions of the current episodes, and those of each agent's checkpoint.
         self._actions: list[Tensor] = []
         self._restored: dict[int, np.ndarray] = {}
@@ -96,18 +93,8 @@ class RlRunner(PolicyRunner):
         parts = zip(self.stacks, self._split(self._own(observations, 1)), strict=True)
         return torch.cat([stack.decide(part) for stack, part in parts]).squeeze(1)
 
-    def take(self) -> list[TrainingSummary]:
-        broken, ended = self._broken, self._ended
-        self._broken, self._ended = {}, []
-        losses = [own for stack in self.stacks for own in stack.take_losses()]
-        # By episode, measure, agent and environment.
-        table = torch.stack(ended).cpu().numpy() if ended else np.full((1, 2, len(losses), 1), np.nan)
-        learned = []
-        for k, own in enumerate(losses):
-            # Summed per agent, to be bitwise independent of the population.
-            means = {name: float(np.mean(table[:, i, k].copy())) for i, name in enumerate(self.columns)}
-            learned.append(TrainingSummary(means, len(ended) * self._envs, broken.get(k, ()), own))
-        return learned
+    def losses(self) -> list[dict[str, float]]:
+        return [own for stack in self.stacks for own in stack.take_losses()]
 
     def states(self) -> list[dict[str, Any]]:
         states = [state for stack in self.stacks for state in stack.states()]
@@ -124,7 +111,7 @@ class RlRunner(PolicyRunner):
         stack, number = self._places[run]
         return (stack.replay, number) if isinstance(stack, OffPolicyAgents) else None
 
-    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
+    def policy(self, run: int) -> Policy:
         stack, number = self._places[run]
         return stack.policy(number)
 
@@ -160,9 +147,8 @@ class RlRunner(PolicyRunner):
         self._actions.append(actions)
         if done.truncated.all():
             for env, text in done.failures.items():
-                self._broken.setdefault(env // self._envs, []).append(text)
-            score = self._own(done.info["score"], self._envs).squeeze(2)
-            self._ended.append(torch.stack([self._reward, score]))
+                self.records[env // self._envs].broken.append(text)
+            self.note(train_reward=self._reward, train_score=done.info["score"])
             self._reward.zero_()
             self._actions = []
         return done

@@ -8,7 +8,6 @@ written by the library's ``save``, which uses pickle, so resume only your own ru
 from __future__ import annotations
 
 import io
-import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,8 +27,8 @@ from plab.config.families import family
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.agents import LARGEST, OffPolicyConfig, ReplayBuffer, Sizes
-from plab.runners.policy import Moments, Policy, Spaces
-from plab.runners.training import PolicyRunner, TrainingSummary
+from plab.runners.policy import Policy, Spaces
+from plab.runners.training import PolicyRunner
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,6 @@ class Sb3Runner(PolicyRunner):
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
-        self._ended: list[Mapping[str, Any]] = []
 
     @property
     def steps(self) -> int:
@@ -111,20 +109,15 @@ class Sb3Runner(PolicyRunner):
 
     def _watch(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
-            self._ended += infos
+            rewards = np.array([info["episode"]["r"] for info in infos])
+            self.note(train_reward=rewards, train_score=np.array([info["score"] for info in infos]))
+            self.records[0].broken += [info["failure"] for info in infos if "failure" in info]
             self.report(self.episodes, self._shown)
         return True
 
-    def decide(self, observations: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
-
-    def take(self) -> list[TrainingSummary]:
-        ended, self._ended = self._ended, []
-        values = [float(info["episode"]["r"]) for info in ended], [info["score"] for info in ended]
-        means = {n: float(np.mean(v)) if v else math.nan for n, v in zip(self.columns, values, strict=True)}
+    def losses(self) -> list[dict[str, float]]:
         logged = self.model.logger.name_to_value.items()
-        losses = {n.removeprefix("train/"): float(v) for n, v in logged if n.startswith("train/")}
-        return [TrainingSummary(means, len(ended), [i["failure"] for i in ended if "failure" in i], losses)]
+        return [{name: float(value) for name, value in logged if name.startswith("train/")}]
 
     def states(self) -> list[dict[str, Any]]:
         model, written = self.model, io.BytesIO()
@@ -154,8 +147,8 @@ class Sb3Runner(PolicyRunner):
         buffer = getattr(self.model, "replay_buffer", None)
         return None if buffer is None else (buffer.kept, 0)
 
-    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
-        return self.model.policy, None
+    def policy(self, run: int) -> Policy:
+        return Policy(self.model.policy)
 
 
 class _Replay(LibraryBuffer):

@@ -21,7 +21,7 @@ from plab.config import ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
 from plab.runners.policy import Spaces, set_rate
-from plab.runners.training import ActorConfig, ActorRunner, actor_network, actor_policy
+from plab.runners.training import ActorConfig, ActorRunner, actor_network
 
 if TYPE_CHECKING:
     from plab.envs.autograd import PolicySteps
@@ -68,12 +68,14 @@ class ShacRunner(ActorRunner):
             self._value = actor_network(self._spaces, 1, method.hidden).to(self._device)
         self._target = copy.deepcopy(self._value).requires_grad_(False)
         self._value_optimizer = torch.optim.Adam(self._value.parameters(), lr=method.value_lr)
+        self.learners |= {"value": self._value, "target": self._target}
+        self.learners["value_optimizer"] = self._value_optimizer
 
     @staticmethod
     def make_policy(method: ShacConfig, spaces: Spaces) -> Any:
         """Return the initial policy, on the CPU. The standard deviation of the actions, before the hyperbolic
         tangent, is learned and independent of the observation."""
-        policy = actor_policy(spaces, method.hidden)
+        policy = ActorRunner.make_policy(method, spaces)
         deviation = torch.full(spaces.action_space.shape, math.log(method.noise))
         policy.log_std = torch.nn.Parameter(deviation)
         return policy
@@ -139,10 +141,6 @@ class ShacRunner(ActorRunner):
         with torch.no_grad():
             for follower, leader in zip(self._target.parameters(), self._value.parameters(), strict=True):
                 follower.lerp_(leader, method.tau)
-
-    def learners(self) -> dict[str, Any]:
-        own = {"value": self._value, "target": self._target, "value_optimizer": self._value_optimizer}
-        return super().learners() | own
 
 
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:

@@ -25,7 +25,6 @@ from plab.plugins import torch
 from plab.results.run_file import REPLAY_SUFFIX
 from plab.runners.policy import (
     CLIP,
-    Moments,
     Policy,
     PolicyConfig,
     Spaces,
@@ -47,7 +46,6 @@ from plab.runners.runner import (
 )
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import BasePolicy
     from torch import Tensor
 
     from plab.envs.core import EpisodeBatch
@@ -57,8 +55,6 @@ if TYPE_CHECKING:
 DEVIATION_MIN = 0.01
 """Least standard deviation for scaling observations [domain units, domain units / s]. Otherwise nearly
 constant entries, scaled up, would dominate the gradient through the policy."""
-
-NOT_FINITE = "the policy's actions are not finite"
 
 _log = logging.getLogger(__name__)
 
@@ -133,20 +129,16 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
 
 
 @dataclass
-class TrainingSummary:
+class TrainingRecord:
     """Training of a policy since its last evaluation.
 
     Attributes:
-        measures: Means over the finished episodes, by training column; NaN if none has finished.
-        ended: Number of finished episodes.
+        measures: Values of the finished episodes, by training column.
         broken: Times and reasons of divergence; diverged environments are frozen until the episode ends.
-        losses: Mean losses of the updates, by name.
     """
 
-    measures: dict[str, float]
-    ended: int
-    broken: Sequence[str] = ()
-    losses: Mapping[str, float] = field(default_factory=dict)
+    measures: dict[str, list[float]] = field(default_factory=dict)
+    broken: list[str] = field(default_factory=list)
 
 
 class PolicyRunner(Runner, ABC):
@@ -159,15 +151,17 @@ class PolicyRunner(Runner, ABC):
     Attributes:
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
+        simulates: Whether there are training environments.
+        records: Training of each policy since its last evaluation.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
-    """Measures of :class:`TrainingSummary`."""
+    """Measures of :class:`TrainingRecord`; the rows have their means, or NaN if no episode has finished."""
 
     round_episodes: tuple[int, int] = 1, 0
     """Episodes per environment in a cycle, and episodes with gradient."""
 
-    simulates, tf32 = True, False
+    tf32 = False
 
     # ------------------------------------------------------------------------------------------------ hooks
 
@@ -188,14 +182,14 @@ class PolicyRunner(Runner, ABC):
     def cycle(self) -> None:
         """Train for one cycle and report the progress."""
 
-    @abstractmethod
     def decide(self, observations: Tensor) -> Tensor:
         """Return the actions of the deterministic policies, shape [run, A], given one observation each, shape
-        [run, entry]."""
+        [run, entry]; by default those of a single policy."""
+        return torch.as_tensor(self.policy(0)(observations.cpu().numpy()))
 
-    @abstractmethod
-    def take(self) -> list[TrainingSummary]:
-        """Return a summary of each policy's training since the last call."""
+    def losses(self) -> list[dict[str, float]]:
+        """Return the mean losses of each policy since the last call, by name in a log; by default none."""
+        return [{} for _ in self.tracks]
 
     @abstractmethod
     def states(self) -> list[dict[str, Any]]:
@@ -211,8 +205,8 @@ class PolicyRunner(Runner, ABC):
         return None
 
     @abstractmethod
-    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
-        """Return a policy as a Stable-Baselines3 policy, and the scaling of its observations, if any."""
+    def policy(self, run: int) -> Policy:
+        """Return a policy."""
 
     # ------------------------------------------------------------------------------- shared implementation
 
@@ -221,6 +215,14 @@ class PolicyRunner(Runner, ABC):
         cycle and policy."""
         self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
         self.total_steps = math.ceil(self.method.episodes * self._horizon / cycle) * cycle
+        self.records = [TrainingRecord() for _ in self.tracks]
+
+    def note(self, **values: Tensor | np.ndarray) -> None:
+        """Record values of finished training episodes, one per environment, in the order of the policies."""
+        for name, entries in values.items():
+            rows = torch.as_tensor(entries).reshape(len(self.records), -1).tolist()
+            for record, row in zip(self.records, rows, strict=True):
+                record.measures.setdefault(name, []).extend(row)
 
     @property
     def episodes(self) -> int:
@@ -247,6 +249,7 @@ class PolicyRunner(Runner, ABC):
             raise ConfigError(
                 "method.torch_device=cuda: PyTorch has no CUDA device; choose method.torch_device=cpu"
             )
+        self.simulates = bool(training)
         kinds = [(training, self.method.contact)] if training else []
         *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))
         self._judge, self.problem = TensorEnv(judge), judge.problem
@@ -277,22 +280,26 @@ class PolicyRunner(Runner, ABC):
             self.train(int(last) + self.method.evaluate_every)
             self.enter("evaluate")
         evaluations = evaluate(self._judge, self.decide)
-        learned, states = self.take(), self.states()
+        losses, states = self.losses(), self.states()
+        records, self.records = self.records, [TrainingRecord() for _ in self.tracks]
         every, differentiated = self.round_episodes
         simulated = self.steps - before if self.simulates else 0
         gradient = simulated // every * differentiated
-        for track, done, own, state in zip(tracks, evaluations, learned, states, strict=True):
-            if why := _unusable(track, own, done):
+        for track, done, own, lost, state in zip(tracks, evaluations, records, losses, states, strict=True):
+            # A value stands for all episodes of an environment in a round.
+            ended = every * len(own.measures.get(self.columns[0], ()))
+            if why := _unusable(track, own.broken, ended, done):
                 track.fail(why)
                 continue
+            means = {name: float(np.mean(own.measures.get(name, np.nan))) for name in self.columns}
             with track.results_errors():
                 if found := self.replay(track.number):
                     found[0].write(found[1], _replay_path(track))
-                track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, self.steps)
+                track.log.write(lost, self.steps)
             if not track.open:
                 continue
             step = Step(
-                done.measures | own.measures,
+                done.measures | means,
                 done.actions,
                 state,
                 episodes=self.episodes,
@@ -313,7 +320,7 @@ class PolicyRunner(Runner, ABC):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
-        save_policy(track.run.path, self.method, *self.policy(track.number))
+        save_policy(track.run.path, self.method, self.policy(track.number))
         _replay_path(track).unlink(missing_ok=True)
 
 
@@ -321,14 +328,13 @@ def _replay_path(track: Track) -> Path:
     return track.run.path.with_suffix(REPLAY_SUFFIX)
 
 
-def _unusable(track: Track, learned: TrainingSummary, done: Evaluation) -> str:
-    """Return the reason why a run cannot continue, or an empty string; count diverged episodes in the
-    result's provenance, with a warning."""
-    broken = learned.broken
+def _unusable(track: Track, broken: Sequence[str], ended: int, done: Evaluation) -> str:
+    """Return the reason why a run cannot continue, or an empty string; count diverged episodes, of the
+    ``ended`` ones in training and of evaluations, in the result's provenance, with a warning."""
     if not np.isfinite(done.actions).all():
-        return NOT_FINITE
-    if broken and len(broken) >= learned.ended:
-        return f"all {learned.ended} training episodes diverged, the first in {broken[0]}"
+        return "the policy's actions are not finite"
+    if broken and len(broken) >= ended:
+        return f"all {ended} training episodes diverged, the first in {broken[0]}"
     if done.failure and track.best_actions is None:
         return done.failure
     for name, texts in (("episodes", broken), ("evaluations", [done.failure] if done.failure else [])):
@@ -367,26 +373,13 @@ def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.
     return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
 
 
-def actor_policy(spaces: Spaces, hidden: Sequence[int]) -> Any:
-    """Return Stable-Baselines3's policy with the hyperbolic tangent of :func:`actor_network` as actions and
-    torch's default initial weights."""
-    from stable_baselines3.common.torch_layers import FlattenExtractor
-    from stable_baselines3.td3.policies import Actor
-
-    network = actor_network(spaces, spaces.action_space.shape[0], hidden)
-    extractor = FlattenExtractor(spaces.observation_space)
-    policy = Actor(*spaces, net_arch=[], features_extractor=extractor, features_dim=extractor.features_dim)
-    policy.mu = network.append(torch.nn.Tanh())
-    return policy
-
-
 class ActorRunner(PolicyRunner):
     """Base class of runners that train one policy, with its optimiser and training episodes.
 
     Attributes:
         network: The policy.
         statistics: Moments of the observations, used for scaling.
-        broken: Times and reasons of the episodes that diverged since the last evaluation.
+        learners: Networks and optimisers of a checkpoint, by name.
     """
 
     round_episodes, steps = (1, 1), 0
@@ -409,16 +402,24 @@ class ActorRunner(PolicyRunner):
         self._device = torch.device(self.method.torch_device)
         self.network: Any = first_policy(self.method, self._spaces, self._cfg.seed).to(self._device)
         self._optimizer = torch.optim.Adam(self.network.parameters(), lr=self.method.lr)
+        self.learners: dict[str, Any] = {"policy": self.network, "optimizer": self._optimizer}
         self._generator = torch.Generator(self._device).manual_seed(self._cfg.seed)
         self.statistics = RunningMeanStd(shape=self._spaces.observation_space.shape)
-        self._evaluated = 0
-        self.broken: list[str] = []
-        self._measured: dict[str, list[float]] = {}
 
     @staticmethod
-    def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
-        """Return the initial policy, on the CPU."""
-        return actor_policy(spaces, method.hidden)
+    def make_policy(method: Any, spaces: Spaces) -> Any:
+        """Return Stable-Baselines3's policy with the hyperbolic tangent of :func:`actor_network` as actions
+        and torch's default initial weights, on the CPU."""
+        from stable_baselines3.common.torch_layers import FlattenExtractor
+        from stable_baselines3.td3.policies import Actor
+
+        network = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
+        extractor = FlattenExtractor(spaces.observation_space)
+        policy = Actor(
+            *spaces, net_arch=[], features_extractor=extractor, features_dim=extractor.features_dim
+        )
+        policy.mu = network.append(torch.nn.Tanh())
+        return policy
 
     def cycle(self) -> None:
         self.learn(1.0 - self.steps / self.total_steps)
@@ -429,14 +430,11 @@ class ActorRunner(PolicyRunner):
     def learn(self, rate_left: float) -> None:
         """Run a round of training episodes; ``rate_left`` decreases linearly from 1 to 0 during training."""
 
-    def decide(self, observations: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(Policy(self.network, *self._moments)(observations.cpu().numpy()))
-
-    def policy(self, run: int) -> tuple[BasePolicy, Moments | None]:
-        return self.network, self._moments
+    def policy(self, run: int) -> Policy:
+        return Policy(self.network, *self._moments)
 
     @property
-    def _moments(self) -> Moments:
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
     def freeze_moments(self) -> None:
@@ -448,27 +446,11 @@ class ActorRunner(PolicyRunner):
         """Scale observations by the moments at the last :meth:`freeze_moments`."""
         return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
 
-    def note(self, **values: torch.Tensor | np.ndarray) -> None:
-        """Store values of a round's episodes, shape [env], until :meth:`take`."""
-        for name, entries in values.items():
-            self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
-
-    def take(self) -> list[TrainingSummary]:
-        known, self._measured = self._measured, {}
-        broken, self.broken = self.broken, []
-        ended, self._evaluated = self.episodes - self._evaluated, self.episodes
-        means = {name: float(np.mean(known[name])) if name in known else np.nan for name in self.columns}
-        return [TrainingSummary(means, ended, broken)]
-
     def states(self) -> list[dict[str, Any]]:
         return [{"torch": packed(self.state())}]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
         self.load(unpacked(state["torch"]))
-
-    def learners(self) -> dict[str, Any]:
-        """Return networks and optimisers by name."""
-        return {"policy": self.network, "optimizer": self._optimizer}
 
     def state(self) -> dict[str, Any]:
         """Return the full training state, as tensors and numbers."""
@@ -477,18 +459,18 @@ class ActorRunner(PolicyRunner):
             "steps": self.steps,
             "generator": self._generator.get_state(),
             "statistics": [torch.as_tensor(values, dtype=torch.float64) for values in moments],
-            **{name: one.state_dict() for name, one in self.learners().items()},
+            **{name: one.state_dict() for name, one in self.learners.items()},
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore a state returned by :meth:`state`; raise RuntimeError if it belongs to other networks."""
-        for name, one in self.learners().items():
+        for name, one in self.learners.items():
             one.load_state_dict(state[name])
         mean, var, count = state["statistics"]
         self.statistics.mean, self.statistics.var = mean.numpy(), var.numpy()
         self.statistics.count = float(count)
         self._generator.set_state(state["generator"])
-        self.steps, self._evaluated = state["steps"], state["steps"] // self._horizon
+        self.steps = state["steps"]
 
 
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:
