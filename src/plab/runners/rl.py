@@ -9,7 +9,7 @@ deterministic policy, which produces a row of the results. To reproduce a result
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,7 +75,7 @@ class RlRunner(PolicyRunner):
         self._observations: Any = None
         # Actions of the current episodes, and those of each agent's checkpoint.
         self._actions: list[Tensor] = []
-        self._restored: dict[int, np.ndarray] = {}
+        self._restored: list[np.ndarray] = []
 
     @property
     def steps(self) -> int:
@@ -90,7 +90,7 @@ class RlRunner(PolicyRunner):
                 self.report(self.episodes, self._shown)
 
     def decide(self, observations: Tensor) -> Tensor:
-        parts = zip(self.stacks, self._split(self._own(observations, 1)), strict=True)
+        parts = self._parts(observations.to(self._device).unsqueeze(1))
         return torch.cat([stack.decide(part) for stack, part in parts]).squeeze(1)
 
     def losses(self) -> list[dict[str, float]]:
@@ -105,7 +105,7 @@ class RlRunner(PolicyRunner):
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
         stack, number = self._places[run]
         stack.restore(number, state)
-        self._restored[run] = state["episode_actions"]
+        self._restored.append(state["episode_actions"])
 
     def replay(self, run: int) -> tuple[ReplayBuffer, int] | None:
         stack, number = self._places[run]
@@ -117,33 +117,29 @@ class RlRunner(PolicyRunner):
 
     def _first_observations(self) -> Tensor:
         """Begin the first episodes, or replay those of the checkpoint; return the observations."""
-        observations = self._own(self._env.reset(episode=self.episodes // self._envs), self._envs)
+        observations = self._by_agent(self._env.reset(episode=self.episodes // self._envs))
         if self.steps == 0:
-            for stack, part in zip(self.stacks, self._split(observations), strict=True):
+            for stack, part in self._parts(observations):
                 stack.begin(part)
-        elif self._restored:
-            acted = np.stack([self._restored[k] for k in range(len(self._restored))], axis=1)
-            for actions in torch.from_numpy(acted).to(self._device):
-                observations = self._own(self._advance(actions).observation, self._envs)
+        else:
+            for actions in torch.from_numpy(np.stack(self._restored, axis=1)).to(self._device):
+                observations = self._by_agent(self._advance(actions).observation)
         return observations
 
     def _step(self) -> None:
         """Make one step of all environments, and the agents' updates."""
-        parts = zip(self.stacks, self._split(self._observations), strict=True)
+        parts = self._parts(self._observations)
         done = self._advance(torch.cat([stack.act(part) for stack, part in parts]))
-        last = self._own(done.observation, self._envs)
-        over = bool(done.truncated.all())
-        observations = self._own(self._env.reset(), self._envs) if over else last
-        rewards = self._own(done.reward, self._envs).squeeze(2).float()
-        gained = (self._split(part) for part in (rewards, last, observations))
-        for stack, *part in zip(self.stacks, *gained, strict=True):
+        last, over = self._by_agent(done.observation), bool(done.truncated.all())
+        self._observations = self._by_agent(self._env.reset()) if over else last
+        rewards = self._by_agent(done.reward).float()
+        for stack, *part in self._parts(rewards, last, self._observations):
             stack.learn(*part, over=over)
-        self._observations = observations
 
     def _advance(self, actions: Tensor) -> Transition:
         """Advance the environments, and accumulate the totals of episodes."""
         done = self._env.step(actions.double().nan_to_num().flatten(0, 1), strict=False)
-        self._reward += self._own(done.reward, self._envs).squeeze(2)
+        self._reward += self._by_agent(done.reward)
         self._actions.append(actions)
         if done.truncated.all():
             for env, text in done.failures.items():
@@ -153,12 +149,14 @@ class RlRunner(PolicyRunner):
             self._actions = []
         return done
 
-    def _own(self, table: Tensor, envs: int) -> Tensor:
-        """Return a table of all environments, grouped by agent, shape [agent, env, entry or 1]."""
-        return table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
+    def _by_agent(self, table: Tensor) -> Tensor:
+        """Return a table of all environments on the networks' device, shape [agent, env, ...]."""
+        return table.to(self._device).unflatten(0, (-1, self._envs))
 
-    def _split(self, table: Tensor) -> list[Tensor]:
-        return list(table.split([stack.count for stack in self.stacks]))
+    def _parts(self, *tables: Tensor) -> Iterator[tuple[Any, ...]]:
+        """Return each stack, and its rows of tables, shape [agent, ...]."""
+        counts = [stack.count for stack in self.stacks]
+        return zip(self.stacks, *(table.split(counts) for table in tables), strict=True)
 
 
 FAMILY = Family(

@@ -79,26 +79,20 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
     """Run an episode of a deterministic policy in each environment of a batch; ``decide`` maps observations,
     shape [env, entry], to actions, shape [env, A]."""
     columns = episode_columns(env.batch.problem.term_names)
-    observations = env.reset()
-    sums: dict[str, Tensor] = {}
+    final = torch.tensor([[name in FINAL_STATE_COLUMNS] for name in columns], device=env.device)
+    observations, totals = env.reset(), torch.zeros(())
     actions: list[Tensor] = []
-    failures: dict[int, str] = {}
     for _ in range(env.batch.horizon):
         actions.append(decide(observations))
         done = env.step(actions[-1].double().nan_to_num(), strict=False)
-        failures = dict(done.failures) | failures
         values = done.info | {"reward": done.reward}
-        sums = {
-            n: values[n] if n in FINAL_STATE_COLUMNS or n not in sums else sums[n] + values[n]
-            for n in columns
-        }
+        row = torch.stack([values[name] for name in columns])
+        totals = torch.where(final, row, totals + row)
         observations = done.observation
-    # Copied from the device together.
-    rows = torch.stack([sums[name] for name in columns]).cpu().numpy().T
     ran = torch.stack(actions, dim=1).cpu().numpy()
     return [
-        Evaluation(dict(zip(columns, own.tolist(), strict=True)), ran[e], failures.get(e, ""))
-        for e, own in enumerate(rows)
+        Evaluation(dict(zip(columns, own, strict=True)), ran[e], done.failures.get(e, ""))
+        for e, own in enumerate(totals.T.tolist())
     ]
 
 
