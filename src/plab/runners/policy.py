@@ -11,7 +11,6 @@ import io
 import itertools
 import json
 import math
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -20,10 +19,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from plab.config import ConfigError, MethodConfig, ranges
-from plab.config.families import FAMILIES, family
+from plab.config import MethodConfig, ranges
+from plab.config.families import family, known_family
 from plab.files import one_line, read_arrays
 from plab.plugins import torch
 from plab.results import ResultsError
@@ -214,12 +212,20 @@ def _policy(path: Path) -> Policy:
     header = json.loads(str(arrays["header"][()]).encode())
     if header["format"] != _FORMAT:
         raise ValueError(f"it has the format {header['format']!r:.80}, not {_FORMAT!r}")
-    method = _method(header["method"], path)
+    section = header["method"]
+    name = str(section["family"])
+    # A file must not determine imports.
+    if (own := known_family(name)) is None:
+        module = name.partition(":")[0]
+        raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} first")
+    merged = OmegaConf.merge(OmegaConf.structured(own.config_type(section["algorithm"])), section)
+    method = cast(PolicyConfig, OmegaConf.to_object(merged))
+    method.check("method")
     from gymnasium.spaces import Box
 
     spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
-    own = [name for name in arrays if name.startswith(_PARAMETER)]
-    parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in own}
+    kept = [name for name in arrays if name.startswith(_PARAMETER)]
+    parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in kept}
     # Checked before networks of that size are created.
     widths = [spaces.sizes[0], *method.hidden, spaces.sizes[1]]
     needed = sum(map(math.prod, itertools.pairwise(widths)))
@@ -228,21 +234,3 @@ def _policy(path: Path) -> Policy:
     network = first_policy(method, spaces)
     network.load_state_dict(parameters)
     return Policy(network, arrays.get("mean"), arrays.get("variance"))
-
-
-def _method(section: Any, path: Path) -> PolicyConfig:
-    """Return the ``method`` section of a policy's header, with the type of its family."""
-    name = str(section["family"])
-    # A file must not determine imports.
-    if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
-        raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} first")
-    try:
-        kind = family(name).config_type(section["algorithm"])
-        method = cast(PolicyConfig, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section)))
-        method.check("method")
-    except ConfigError as error:
-        raise ResultsError(f"{path}: {one_line(error)}") from error
-    except OmegaConfBaseException as error:
-        why = (error.msg or str(error)).splitlines()[0]
-        raise ValueError(f"its method section is invalid: {why}") from error
-    return method
