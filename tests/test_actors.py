@@ -200,7 +200,7 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsRunner, monkey
     assert len(tried) == 3
     np.testing.assert_allclose(tried[1], tried[0], atol=0.05 + 1e-6)
     assert (tried[1] != tried[0]).any()
-    own = training.records[0].measures
+    own = training.measured[0]
     assert np.mean(own["plan_reward"]) > np.mean(own["train_reward"])
     # The policy does now what the plan was, far from what it did before.
     _, actions = training._episode(None, "train")
@@ -249,7 +249,7 @@ def test_environments_that_break_off_teach_nothing(
     monkeypatch.setattr(training, "imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
     training.cycle()
     # Each of the three episodes with gradient.
-    assert len(training.records[0].broken) == 3 * len(broken)
+    assert len(training.broken[0]) == 3 * len(broken)
     # Two ways of each of the others.
     assert learned == ([4 * HORIZON] if len(broken) == 1 else [])
     after = list(training.network.parameters())

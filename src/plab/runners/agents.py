@@ -143,15 +143,6 @@ class Sizes(NamedTuple):
         return min(math.ceil(total_steps / self.envs / self.horizon), held)
 
 
-class Samples(NamedTuple):
-    """Sampled transitions, each of shape [agent, row, ...]; rewards have no third axis."""
-
-    observations: Tensor
-    actions: Tensor
-    next_observations: Tensor
-    rewards: Tensor
-
-
 class ReplayBuffer:
     """Transitions of K agents in lockstep; each observation is stored once.
 
@@ -199,8 +190,9 @@ class ReplayBuffer:
         """Number of steps of all N environments that can be sampled."""
         return min(self.added, self._window)
 
-    def sample(self, numbers: Tensor) -> Samples:
-        """Sample transitions uniformly, given large random integers, shape [agent, row]."""
+    def sample(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Sample transitions uniformly, given large random integers, shape [agent, row]; return observations,
+        actions and next observations, shape [agent, row, entry], and rewards, shape [agent, row]."""
         n, horizon = self._sizes.envs, self._sizes.horizon
         env, steps = numbers % n, self._first + numbers // n % self._count
         episode = self._agent * self._capacity + steps // horizon % self._capacity
@@ -209,7 +201,7 @@ class ReplayBuffer:
         place = ((episode * horizon + step) * n + env).reshape(-1)
         observations = self._observations.view(-1, self._sizes.observed)
         shape = *numbers.shape, -1
-        return Samples(
+        return (
             observations.index_select(0, first).view(shape),
             self._actions.view(-1, self._sizes.actions).index_select(0, place).view(shape),
             observations.index_select(0, first + n).view(shape),

@@ -131,7 +131,7 @@ class PodsRunner(ImitationRunner):
 
     def _note_failures(self, failures: Mapping[int, str]) -> None:
         self._failed |= set(failures)
-        self.records[0].broken += failures.values()
+        self.broken[0] += failures.values()
 
     def state(self) -> dict[str, Any]:
         return super().state() | {"rounds": self._rounds}

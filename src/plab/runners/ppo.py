@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.config import ConfigError, ranges
 from plab.plugins import torch
@@ -13,7 +13,6 @@ from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp
 from plab.runners.policy import CLIP, EPSILON, Policy, Spaces, set_rate
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import ActorCriticPolicy
     from torch import Tensor
 
 ACTION_GAIN = 0.01
@@ -137,16 +136,15 @@ class PpoAgents(Agents):
         self._over: list[bool] = []
 
     @staticmethod
-    def make_policy(method: PpoConfig, spaces: Spaces) -> ActorCriticPolicy:
+    def make_policy(method: PpoConfig, spaces: Spaces) -> Any:
         """Return Stable-Baselines3's policy, with orthogonal initial weights and the method's gains."""
         from stable_baselines3.common.policies import ActorCriticPolicy
 
-        policy = ActorCriticPolicy(
+        policy: Any = ActorCriticPolicy(
             *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=torch.nn.Tanh
         )
-        last = (policy.action_net, method.policy_gain / ACTION_GAIN), (policy.value_net, method.value_gain)
-        for layer, gain in last:
-            cast("torch.nn.Linear", layer).weight.data.mul_(gain)
+        policy.action_net.weight.data.mul_(method.policy_gain / ACTION_GAIN)
+        policy.value_net.weight.data.mul_(method.value_gain)
         return policy
 
     def policy(self, agent: int) -> Policy:

@@ -143,7 +143,7 @@ class RlRunner(PolicyRunner):
         self._actions.append(actions)
         if done.truncated.all():
             for env, text in done.failures.items():
-                self.records[env // self._envs].broken.append(text)
+                self.broken[env // self._envs].append(text)
             self.note(train_reward=self._reward, train_score=done.info["score"])
             self._reward.zero_()
             self._actions = []

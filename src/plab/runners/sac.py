@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.plugins import torch
 from plab.runners.agents import (
@@ -20,7 +20,6 @@ from plab.runners.agents import (
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
-    from stable_baselines3.sac.policies import SACPolicy
     from torch import Tensor
 
 LOG_STD = -20.0, 2.0
@@ -60,18 +59,17 @@ class SacAgents(OffPolicyAgents):
         self.optimizers = {name: adam(part, self.method.lr) for name, part in own.items()}
 
     @staticmethod
-    def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
+    def make_policy(method: SacConfig, spaces: Spaces) -> Any:
         """Return Stable-Baselines3's policy with Glorot uniform weights and zero biases."""
         from stable_baselines3.sac.policies import SACPolicy
 
         policy = SACPolicy(
             *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=torch.nn.ReLU
         )
-        for part in (policy.actor, policy.critic):
-            for layer in part.modules():
-                if isinstance(layer, torch.nn.Linear):
-                    torch.nn.init.xavier_uniform_(layer.weight)
-                    torch.nn.init.zeros_(layer.bias)
+        for layer in policy.modules():
+            if isinstance(layer, torch.nn.Linear):
+                torch.nn.init.xavier_uniform_(layer.weight)
+                torch.nn.init.zeros_(layer.bias)
         policy.critic_target.load_state_dict(policy.critic.state_dict())
         return policy
 

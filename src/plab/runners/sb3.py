@@ -111,7 +111,7 @@ class Sb3Runner(PolicyRunner):
         if "episode" in infos[0]:
             rewards = np.array([info["episode"]["r"] for info in infos])
             self.note(train_reward=rewards, train_score=np.array([info["score"] for info in infos]))
-            self.records[0].broken += [info["failure"] for info in infos if "failure" in info]
+            self.broken[0] += [info["failure"] for info in infos if "failure" in info]
             self.report(self.episodes, self._shown)
         return True
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from plab.config import ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
+from plab.runners.agents import follow
 from plab.runners.policy import Spaces, set_rate
 from plab.runners.training import ActorConfig, ActorRunner, actor_network
 
@@ -138,9 +139,7 @@ class ShacRunner(ActorRunner):
                 error.backward()
                 torch.nn.utils.clip_grad_norm_(self._value.parameters(), method.max_gradient_norm)
                 self._value_optimizer.step()
-        with torch.no_grad():
-            for follower, leader in zip(self._target.parameters(), self._value.parameters(), strict=True):
-                follower.lerp_(leader, method.tau)
+        follow(list(self._target.parameters()), list(self._value.parameters()), method.tau)
 
 
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.config import ranges
 from plab.plugins import torch
@@ -19,7 +19,6 @@ from plab.runners.agents import (
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
-    from stable_baselines3.td3.policies import TD3Policy
     from torch import Tensor
 
 
@@ -59,7 +58,7 @@ class Td3Agents(OffPolicyAgents):
         self.optimizers = {part: adam(self.parameters(part), self.method.lr) for part in ("critics", "actor")}
 
     @staticmethod
-    def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
+    def make_policy(method: Td3Config, spaces: Spaces) -> Any:
         """Return Stable-Baselines3's policy with its default initial weights."""
         from stable_baselines3.td3.policies import TD3Policy
 

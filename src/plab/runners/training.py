@@ -122,19 +122,6 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
     )
 
 
-@dataclass
-class TrainingRecord:
-    """Training of a policy since its last evaluation.
-
-    Attributes:
-        measures: Values of the finished episodes, by training column.
-        broken: Times and reasons of divergence; diverged environments are frozen until the episode ends.
-    """
-
-    measures: dict[str, list[float]] = field(default_factory=dict)
-    broken: list[str] = field(default_factory=list)
-
-
 class PolicyRunner(Runner, ABC):
     """Base class of runners that train policies in lockstep; each iteration consists of some training
     episodes and one evaluation episode per policy.
@@ -146,11 +133,13 @@ class PolicyRunner(Runner, ABC):
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
         simulates: Whether there are training environments.
-        records: Training of each policy since its last evaluation.
+        measured: Values of each policy's finished episodes since its last evaluation, by column.
+        broken: Times and reasons of their divergence; diverged environments are frozen until their episode
+            ends.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
-    """Measures of :class:`TrainingRecord`; the rows have their means, or NaN if no episode has finished."""
+    """Measures of training episodes; the rows have their means, or NaN if no episode has finished."""
 
     round_episodes: tuple[int, int] = 1, 0
     """Episodes per environment in a cycle, and episodes with gradient."""
@@ -209,14 +198,15 @@ class PolicyRunner(Runner, ABC):
         cycle and policy."""
         self.batch, self._horizon, self._cycle_steps = batch, batch.horizon, cycle
         self.total_steps = math.ceil(self.method.episodes * self._horizon / cycle) * cycle
-        self.records = [TrainingRecord() for _ in self.tracks]
+        self.measured: list[dict[str, list[float]]] = [{} for _ in self.tracks]
+        self.broken: list[list[str]] = [[] for _ in self.tracks]
 
     def note(self, **values: Tensor | np.ndarray) -> None:
         """Record values of finished training episodes, one per environment, in the order of the policies."""
         for name, entries in values.items():
-            rows = torch.as_tensor(entries).reshape(len(self.records), -1).tolist()
-            for record, row in zip(self.records, rows, strict=True):
-                record.measures.setdefault(name, []).extend(row)
+            rows = torch.as_tensor(entries).reshape(len(self.measured), -1).tolist()
+            for measured, row in zip(self.measured, rows, strict=True):
+                measured.setdefault(name, []).extend(row)
 
     @property
     def episodes(self) -> int:
@@ -275,21 +265,22 @@ class PolicyRunner(Runner, ABC):
             self.enter("evaluate")
         evaluations = evaluate(self._judge, self.decide)
         losses, states = self.losses(), self.states()
-        records, self.records = self.records, [TrainingRecord() for _ in self.tracks]
         every, differentiated = self.round_episodes
         simulated = self.steps - before if self.simulates else 0
         gradient = simulated // every * differentiated
-        for track, done, own, lost, state in zip(tracks, evaluations, records, losses, states, strict=True):
+        for k, (track, done, own, state) in enumerate(zip(tracks, evaluations, losses, states, strict=True)):
+            measured, broken = self.measured[k], self.broken[k]
+            self.measured[k], self.broken[k] = {}, []
             # A value stands for all episodes of an environment in a round.
-            ended = every * len(own.measures.get(self.columns[0], ()))
-            if why := _unusable(track, own.broken, ended, done):
+            ended = every * len(measured.get(self.columns[0], ()))
+            if why := _unusable(track, broken, ended, done):
                 track.fail(why)
                 continue
-            means = {name: float(np.mean(own.measures.get(name, np.nan))) for name in self.columns}
+            means = {name: float(np.mean(measured.get(name, np.nan))) for name in self.columns}
             with track.results_errors():
                 if found := self.replay(track.number):
                     found[0].write(found[1], _replay_path(track))
-                track.log.write(lost, self.steps)
+                track.log.write(own, self.steps)
             if not track.open:
                 continue
             step = Step(
