@@ -153,8 +153,8 @@ def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
     # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
     _, judge = batches_of(make_config(result.path.parents[2], method))
     policy, last = load_policy(result.path), rows.iloc[-1]
-    (done,) = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen.numpy())))
-    for name, value in done.measures.items():
+    (measures,), _, _ = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen.numpy())))
+    for name, value in measures.items():
         assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
 
 

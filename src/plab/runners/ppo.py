@@ -128,7 +128,7 @@ class PpoAgents(Agents):
         self.tensors["returns"] = self._returns
         parameters = self.parameters()
         self.optimizers = {"policy": adam(parameters, self.method.lr, eps=self.method.adam_eps)}
-        rollout = agents, envs, self._length
+        rollout: tuple[int, ...] = agents, envs, self._length
         shapes = {"observations": (*rollout, self.sizes.observed), "actions": (*rollout, self.sizes.actions)}
         shapes |= dict.fromkeys(("values", "log_probs", "advantages", "returns"), rollout)
         self.rollout = {name: torch.zeros(shape, device=device) for name, shape in shapes.items()}

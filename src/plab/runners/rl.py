@@ -67,8 +67,7 @@ class RlRunner(PolicyRunner):
                     f"{len(cfgs)} replay buffers of {each:.1f} GB do not fit into {room:.1f} GB: set a "
                     "smaller method.buffer_size, or method.torch_device=cpu"
                 )
-        size = len(cfgs) if cuda else 1
-        parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
+        parts = [cfgs] if cuda else [[cfg] for cfg in cfgs]
         self.stacks: list[Agents] = [kind(part, spaces, self._device, self.total_steps) for part in parts]
         self._places = [(stack, number) for stack in self.stacks for number in range(stack.count)]
         self._reward = torch.zeros((len(cfgs), self._envs), dtype=torch.float64, device=self._device)

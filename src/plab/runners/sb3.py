@@ -86,13 +86,13 @@ class Sb3Runner(PolicyRunner):
         rollout = self._kind.rollout_steps
         steps = batch.horizon if rollout is None else rollout(method)
         self.set_cycle(batch, method.num_envs * steps)
-        self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
+        sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
         self._envs = PlabVecEnv(batch)
         self._envs.together = True
         self._env = VecMonitor(self._envs)
         arguments = self._kind.arguments(method, self._env)
         if isinstance(method, OffPolicyConfig):
-            kept = {"sizes": self._sizes, "total_steps": self.total_steps}
+            kept = {"sizes": sizes, "total_steps": self.total_steps}
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
@@ -135,7 +135,7 @@ class Sb3Runner(PolicyRunner):
         # Interrupted episodes start again.
         self.model = self._kind.model.load(io.BytesIO(state["model"].tobytes()), self._env, self._device)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
-        self._envs.next_episode = self.episodes // self._sizes.envs
+        self._envs.next_episode = self.episodes // self.method.num_envs
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])

@@ -59,25 +59,19 @@ constant entries, scaled up, would dominate the gradient through the policy."""
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Result of an evaluation episode.
+def evaluate(
+    env: TensorEnv, decide: Callable[[Tensor], Tensor]
+) -> tuple[list[dict[str, float]], np.ndarray, Mapping[int, str]]:
+    """Run an episode of a deterministic policy in each environment of a batch.
 
-    Attributes:
-        measures: Values of :func:`plab.runners.runner.episode_columns`.
-        actions: Actions, shape [T, A].
-        failure: Time and reason of a divergence, or empty. The episode is frozen afterwards, see
-            :meth:`plab.envs.core.EpisodeBatch.step`.
+    Args:
+        env: The environments. Diverged ones are frozen, see :meth:`plab.envs.core.EpisodeBatch.step`.
+        decide: Function from observations, shape [env, entry], to actions, shape [env, A].
+
+    Returns:
+        Values of :func:`plab.runners.runner.episode_columns` for each environment; actions, shape
+        [env, T, A]; and times and reasons of divergence by environment.
     """
-
-    measures: dict[str, float]
-    actions: np.ndarray
-    failure: str
-
-
-def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluation]:
-    """Run an episode of a deterministic policy in each environment of a batch; ``decide`` maps observations,
-    shape [env, entry], to actions, shape [env, A]."""
     columns = episode_columns(env.batch.problem.term_names)
     final = torch.tensor([[name in FINAL_STATE_COLUMNS] for name in columns], device=env.device)
     observations, totals = env.reset(), torch.zeros(())
@@ -89,11 +83,8 @@ def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluat
         row = torch.stack([values[name] for name in columns])
         totals = torch.where(final, row, totals + row)
         observations = done.observation
-    ran = torch.stack(actions, dim=1).cpu().numpy()
-    return [
-        Evaluation(dict(zip(columns, own, strict=True)), ran[e], done.failures.get(e, ""))
-        for e, own in enumerate(totals.T.tolist())
-    ]
+    measures = [dict(zip(columns, own, strict=True)) for own in totals.T.tolist()]
+    return measures, torch.stack(actions, dim=1).cpu().numpy(), done.failures
 
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) -> list[EpisodeBatch]:
@@ -230,9 +221,7 @@ class PolicyRunner(Runner, ABC):
         cfgs = [track.cfg for track in self.tracks]
         training = [one for cfg in cfgs for one in self.environments(cfg)]
         if self.method.torch_device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError(
-                "method.torch_device=cuda: PyTorch has no CUDA device; choose method.torch_device=cpu"
-            )
+            raise ConfigError("method.torch_device=cuda: PyTorch has no CUDA device; choose cpu")
         self.simulates = bool(training)
         kinds = [(training, self.method.contact)] if training else []
         *own, judge = shared_batches(self.cache, *kinds, ([without_draws(cfg) for cfg in cfgs], "hard"))
@@ -263,17 +252,17 @@ class PolicyRunner(Runner, ABC):
             last = tracks[0].run.result.columns["episodes"][-1]
             self.train(int(last) + self.method.evaluate_every)
             self.enter("evaluate")
-        evaluations = evaluate(self._judge, self.decide)
+        measures, actions, failures = evaluate(self._judge, self.decide)
         losses, states = self.losses(), self.states()
         every, differentiated = self.round_episodes
         simulated = self.steps - before if self.simulates else 0
         gradient = simulated // every * differentiated
-        for k, (track, done, own, state) in enumerate(zip(tracks, evaluations, losses, states, strict=True)):
-            measured, broken = self.measured[k], self.broken[k]
+        for k, (track, own, state) in enumerate(zip(tracks, losses, states, strict=True)):
+            measured, broken, failure = self.measured[k], self.broken[k], failures.get(k, "")
             self.measured[k], self.broken[k] = {}, []
             # A value stands for all episodes of an environment in a round.
             ended = every * len(measured.get(self.columns[0], ()))
-            if why := _unusable(track, broken, ended, done):
+            if why := _unusable(track, broken, ended, actions[k], failure):
                 track.fail(why)
                 continue
             means = {name: float(np.mean(measured.get(name, np.nan))) for name in self.columns}
@@ -284,15 +273,15 @@ class PolicyRunner(Runner, ABC):
             if not track.open:
                 continue
             step = Step(
-                done.measures | means,
-                done.actions,
+                measures[k] | means,
+                actions[k],
                 state,
                 episodes=self.episodes,
                 steps=self.steps,
-                steps_forward=len(done.actions) + simulated - gradient,
+                steps_forward=self._horizon + simulated - gradient,
                 steps_gradient=gradient,
                 keep=self.steps >= self.total_steps,
-                whole=not done.failure,
+                whole=not failure,
             )
             yield track, step
 
@@ -313,16 +302,17 @@ def _replay_path(track: Track) -> Path:
     return track.run.path.with_suffix(REPLAY_SUFFIX)
 
 
-def _unusable(track: Track, broken: Sequence[str], ended: int, done: Evaluation) -> str:
-    """Return the reason why a run cannot continue, or an empty string; count diverged episodes, of the
-    ``ended`` ones in training and of evaluations, in the result's provenance, with a warning."""
-    if not np.isfinite(done.actions).all():
+def _unusable(track: Track, broken: Sequence[str], ended: int, actions: np.ndarray, failure: str) -> str:
+    """Return the reason why a run cannot continue, or an empty string, given the ``broken`` of the ``ended``
+    training episodes, and actions and failure of the evaluation. Count diverged episodes in the result's
+    provenance, with a warning."""
+    if not np.isfinite(actions).all():
         return "the policy's actions are not finite"
     if broken and len(broken) >= ended:
         return f"all {ended} training episodes diverged, the first in {broken[0]}"
-    if done.failure and track.best_actions is None:
-        return done.failure
-    for name, texts in (("episodes", broken), ("evaluations", [done.failure] if done.failure else [])):
+    if failure and track.best_actions is None:
+        return failure
+    for name, texts in (("episodes", broken), ("evaluations", [failure] if failure else [])):
         if texts:
             counts, key = track.run.result.provenance, f"broken_{name}"
             counts[key] = counts.get(key, 0) + len(texts)
@@ -399,10 +389,8 @@ class ActorRunner(PolicyRunner):
         from stable_baselines3.td3.policies import Actor
 
         network = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
-        extractor = FlattenExtractor(spaces.observation_space)
-        policy = Actor(
-            *spaces, net_arch=[], features_extractor=extractor, features_dim=extractor.features_dim
-        )
+        flatten = FlattenExtractor(spaces.observation_space)
+        policy = Actor(*spaces, net_arch=[], features_extractor=flatten, features_dim=flatten.features_dim)
         policy.mu = network.append(torch.nn.Tanh())
         return policy
 
