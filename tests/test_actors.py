@@ -147,7 +147,7 @@ def test_the_scenes_of_a_training_are_drawn(tmp_path: Path, monkeypatch) -> None
     # Those that do not fit are left out; if none does, a run says why.
     monkeypatch.setattr("plab.problem.fits", lambda one: one.seed_scene % 2)
     cfg = make_config("results", "pods", "method.scenes=4")
-    assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003] * 2
+    assert [one.seed_scene for one in training_scenes(cfg, 4)] == [1001, 1003] * 2
     monkeypatch.undo()
     with pytest.raises(SceneError, match=r"dt 0\.01 is above the stability limit"):
         run_config(make_config(tmp_path, "pods", "sim.dt=1e-2"), CACHE)

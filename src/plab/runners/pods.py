@@ -74,7 +74,7 @@ class PodsRunner(ImitationRunner):
         method, batch, self._failed = self.method, self.batch, set[int]()
         if self._turns > 1:
             turn = self.episodes // (self.round_episodes[0] * batch.size)
-            batch.renew(training_scenes(self._cfg, method, batch.size, turn))
+            batch.renew(training_scenes(self._cfg, batch.size, turn))
         self.freeze_moments()
         before, actions = self._episode(None, "train")
         improved = self._improved(actions, method.action_lr * rate_left)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -200,7 +199,7 @@ class PpoAgents(Agents):
             if self.method.lr_decay:
                 began = self.steps + self.sizes.envs - self._size
                 set_rate(self.optimizers["policy"], self.method.lr * (1.0 - began / self.total_steps))
-            self.judge(self._values(observations), self._over)
+            self.judge(self._values(observations))
             rows = math.ceil(self._size / self.method.minibatches)
             for _ in range(self.method.epochs):
                 for numbers in self.random.draw("permutation", self._size).split(rows, dim=1):
@@ -216,10 +215,10 @@ class PpoAgents(Agents):
         mean, std = self._seen.mean.unsqueeze(1), (self._seen.var + EPSILON).sqrt().unsqueeze(1)
         return ((observations - mean) / std).clamp(-CLIP, CLIP).float()
 
-    def judge(self, last_values: Tensor, over: Sequence[bool]) -> None:
+    def judge(self, last_values: Tensor) -> None:
         """Compute advantages and returns of the rollout, given the values after its last step, shape [agent,
-        env], and the ends of episodes."""
-        gamma, table = self.method.gamma, self.rollout
+        env]."""
+        gamma, table, over = self.method.gamma, self.rollout, self._over
         goes_on = 1.0 - torch.tensor(over, dtype=torch.float32, device=self.device)
         values = table["values"]
         after = torch.cat([values[:, :, 1:], last_values.unsqueeze(2)], dim=2)

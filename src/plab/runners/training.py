@@ -366,7 +366,7 @@ class ActorRunner(PolicyRunner):
                 f"{method.algorithm} needs its networks on the simulator's device: set "
                 f"method.torch_device={cfg.sim.device}, as sim.device"
             )
-        return training_scenes(cfg, method, method.num_envs)
+        return training_scenes(cfg, method.num_envs)
 
     def prepare(self, batch: EpisodeBatch) -> None:
         """Initialise; the configuration's seed determines initial weights and all random numbers."""
@@ -446,13 +446,13 @@ class ActorRunner(PolicyRunner):
         self.steps = state["steps"]
 
 
-def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> list[Config]:
+def training_scenes(cfg: Config, count: int, turn: int = 0) -> list[Config]:
     """Return the configurations of ``count`` training environments in a round: the run's own, or the next
     random scenes that fit into the grid, repeated if there are fewer."""
     from plab.problem import drawn_scenes
 
-    scenes = [cfg]
-    if method.scenes:
-        some = min(method.scenes, count)
-        scenes = drawn_scenes(cfg, [(turn * some + k) % method.scenes for k in range(some)])
+    scenes, known = [cfg], cfg.method_as(ActorConfig).scenes
+    if known:
+        some = min(known, count)
+        scenes = drawn_scenes(cfg, [(turn * some + k) % known for k in range(some)])
     return [scenes[k % len(scenes)] for k in range(count)]
