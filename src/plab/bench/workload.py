@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -151,8 +152,10 @@ def time_calls(load: Workload, kind: str, repeats: int) -> tuple[float, np.ndarr
 
 
 def peak_rss_mb() -> float:
-    """Peak resident memory of the process on Linux [MB]."""
-    # Imported here, because Windows has no such module.
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    """Peak resident memory of the process [MB]; NaN if unknown."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return float("nan")
+    peaks = [int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")]
+    return peaks[0] if peaks else float("nan")

@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import traceback
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -53,10 +54,11 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
 
     @functools.wraps(main)
     def answered(argv: Sequence[str] | None = None) -> int:
-        # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if threading.current_thread() is threading.main_thread():
+            # Schedulers and containers send SIGTERM; a run then writes a checkpoint, as after Ctrl-C.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
         _open_output()
         try:
             code = main(list(sys.argv[1:] if argv is None else argv)) or 0
@@ -102,7 +104,9 @@ def prompt_interrupts() -> Iterator[None]:
         print_error("stopped")
         os._exit(EXIT_INTERRUPTED)
 
-    former = [(one, signal.signal(one, leave)) for one in (signal.SIGINT, signal.SIGTERM)]
+    signals = (signal.SIGINT, signal.SIGTERM)
+    main = threading.current_thread() is threading.main_thread()
+    former = [(one, signal.signal(one, leave)) for one in signals if main]
     try:
         yield
     finally:

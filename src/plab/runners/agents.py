@@ -421,6 +421,7 @@ class Agents:
         self.networks = stacked(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._updates: dict[Hashable, CapturedUpdate] = {}
+        self._logged = any(cfg.logger != "none" for cfg in cfgs)
         self._losses: dict[str, list[Tensor]] = {}
         self.build()
 
@@ -513,8 +514,9 @@ class Agents:
 
     def _note(self, losses: Tensor) -> None:
         """Record the losses of an update, shape [loss, agent]; the last of :attr:`LOSSES` may be missing."""
-        for name, row in zip(self.LOSSES, losses.clone(), strict=False):
-            self._losses.setdefault(name, []).append(row)
+        if self._logged:
+            for name, row in zip(self.LOSSES, losses.clone(), strict=False):
+                self._losses.setdefault(name, []).append(row)
 
     def _captured(self, update: Callable[..., Tensor], *arguments: Tensor, **options: bool) -> Tensor:
         """Call a function that is captured as a CUDA graph for each value of its options; the next call
