@@ -14,8 +14,8 @@ from typing import Any
 import pandas as pd
 
 from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, one_protocol, require_possible
-from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
-from plab.errors import ArgumentError, PlabError
+from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, group_names, shipped_file, suite_tasks
+from plab.errors import ArgumentError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
 from plab.results.run_file import NAMES
@@ -23,9 +23,6 @@ from plab.results.run_table import sources_of
 
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that are columns of the table of runs."""
-
-_SINGLE = ("seed_particles", *OBSERVATION_KEYS)
-"""Top-level configuration keys that must agree between averaged runs."""
 
 _IGNORED_KEYS = (
     *("seed", "results_dir", "force", "progress", "logger", "checkpoint_seconds", "protocol.name"),
@@ -36,10 +33,6 @@ _IGNORED_KEYS = (
     "task.release",
 )
 """Keys that may differ between averaged runs."""
-
-
-class MixedRunsError(PlabError, ValueError):
-    """Runs that must not be averaged; the one-line message names an override that selects among them."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +89,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
             empty: none.
 
     Raises:
-        MixedRunsError: If runs to be averaged differ in their settings, or have the same seed.
-        plab.errors.ArgumentError: If there are runs of several protocols, or no runs that differ in
-            ``split``.
+        plab.errors.ArgumentError: If runs to be averaged differ in their settings, or have the same seed; if
+            there are runs of several protocols, or no runs that differ in ``split``.
         plab.config.ConfigError: If the selection cannot match any run.
         plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
@@ -195,26 +187,21 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
         if other is not row:
             keys = [key for key in _differences([other.config, row.config]) if key != "results_dir"]
             how = f"choose one by {keys[0]}=" if keys else "remove one"
-            raise MixedRunsError(f"{other.path} and {row.path} have the same seed: {how}")
+            raise ArgumentError(f"{other.path} and {row.path} have the same seed: {how}")
     for names, configs in groups.items():
         for key, values in _differences(configs).items():
             if key not in _IGNORED_KEYS:
                 texts = " and ".join(map(str, values))
                 advice = f"choose one, for example {key}={values[0]}"
-                raise MixedRunsError(f"runs of {' '.join(names)} differ in {key} ({texts}): {advice}")
+                raise ArgumentError(f"runs of {' '.join(names)} differ in {key} ({texts}): {advice}")
 
 
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Return the dotted keys in which configurations differ, with their values."""
-    first = configs[0]
     # Most sections of thousands of runs are equal and need not be flattened.
-    unlike = {
-        name
-        for config in configs[1:]
-        for name in config.keys() | first.keys()
-        if config.get(name) != first.get(name)
-    }
-    flat = [dict(leaves({name: config[name] for name in config if name in unlike})) for config in configs]
+    names = dict.fromkeys(name for config in configs for name in config)
+    unlike = [name for name in names if any(own.get(name) != configs[0].get(name) for own in configs)]
+    flat = [dict(leaves({name: config.get(name) for name in unlike})) for config in configs]
     seen = {
         key: {json.dumps(own.get(key)): own.get(key) for own in flat}
         for key in dict.fromkeys(key for own in flat for key in own)
@@ -257,34 +244,24 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
-    """Return the settings of plab's files for a method, a task and a protocol, by dotted key."""
-    usual = dict(_default_settings(method, protocol))
-    # Learning rate and contact weight may have values by task.
-    for key, section, choice in (
-        ("method.lr", "lr_by_task", "protocol.numbers"),
-        ("method.loss_weights.contact", "contact_by_task", "protocol.contact"),
-    ):
-        values = shipped_file("method", method).get(section, {}).get(usual[choice], {})
-        if (value := values.get(task, values.get("other"))) is not None:
-            usual[key] = value
+    """Return the settings of plab's files for a method, a task and a protocol, by dotted key, without the
+    method if it is external."""
+    # Composing needs Hydra.
+    from plab.config import load_config
+    from plab.config.overrides import quoted
+    from plab.results import config_dict
+
+    chosen = {"method": method, "protocol": protocol}
+    chosen = {group: name for group, name in chosen.items() if name in group_names(group)}
+    # Learning rate and contact weight may depend on the name of the task. Composing its file is slow.
+    words = [f"task.name={quoted(task)}", *(f"{group}={name}" for group, name in chosen.items())]
+    config = config_dict(load_config(words))
+    names = ["protocol", "sim", "seed_particles", *OBSERVATION_KEYS]
+    names += ["method"] if "method" in chosen else []
+    usual = dict(leaves({name: config[name] for name in names}))
     own = shipped_file("task", task)
     if usual["protocol.numbers"] == "release":
         own = own | own.get("release", {})
     # Bodies, manipulators, targets and variants may be changed freely.
     usual |= {f"task.{key}": value for key, value in own.items() if not isinstance(value, dict)}
     return {key: value for key, value in usual.items() if key not in _IGNORED_KEYS}
-
-
-@functools.cache
-def _default_settings(method: str, protocol: str) -> dict[str, Any]:
-    """Return the method, protocol and sim sections of plab's files, without the method if it is external."""
-    # Composing needs Hydra.
-    from plab.config import choices, load_config
-    from plab.results import config_dict
-
-    known = method in choices("method")
-    words = [f"method={method}"] if known else []
-    words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
-    config = config_dict(load_config(words))
-    names = ["protocol", "sim", *_SINGLE, *(["method"] if known else [])]
-    return dict(leaves({name: config[name] for name in names}))
