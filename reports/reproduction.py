@@ -31,8 +31,7 @@ from plab.report.statistics import load_series
 from plab.report.tables import (
     TOLERANCE,
     agreement,
-    iou_per_configuration,
-    iou_per_task,
+    iou_tables,
     ordered_tasks,
     solvability,
 )
@@ -48,7 +47,7 @@ show_origin(runs, COMMAND)
 # runs of incomplete cells.
 
 # %%
-ours, compared = iou_per_task(runs)
+ours, compared = iou_tables(runs, "task")
 show_table(ours)
 
 # %% [markdown]
@@ -65,7 +64,7 @@ for table in agreement(runs):
 # %%
 def draw_differences(runs):
     """Plot the differences per task and method with their intervals; None without differences."""
-    judged = iou_per_task(runs)[-1].data.dropna(subset=["difference"])
+    judged = iou_tables(runs, "task")[-1].data.dropna(subset=["difference"])
     if judged.empty:
         return None
     tasks = [task for task in ordered_tasks(runs.tasks) if task in set(judged["task"])]
@@ -102,7 +101,7 @@ show_figure(drawing)
 # ## Every configuration
 
 # %%
-every = iou_per_configuration(runs)[-1]
+every = iou_tables(runs, "configuration")[-1]
 show_table(every.cells[every.data["runs"] > 0], every.notes)
 
 # %% [markdown]

@@ -27,8 +27,7 @@ from plab.report.tables import (
     agreement,
     distances,
     hyperparameters,
-    iou_per_configuration,
-    iou_per_task,
+    iou_tables,
     number,
     timing,
 )
@@ -95,7 +94,7 @@ def test_cells_per_task(folder: Path) -> None:
     assert len(runs.table) == 3 * 15 - 1 + 2
     unfinished, others = runs.left_out
     assert "not finished" in unfinished and others.startswith("1 run(s) left out: other")
-    tables = by_form(iou_per_task(runs))
+    tables = by_form(iou_tables(runs, "task"))
     rope = tables["comparison"].cells.set_index(["task", "method"]).loc["Rope"]["paper"]
     assert rope["Adam"] == "0.59 ± 0.13" and rope["PPO"] == "0.38 ± 0.19"
 
@@ -109,7 +108,7 @@ def test_cells_per_task(folder: Path) -> None:
     assert cells.loc["Move", "PPO"] == "0.45 ± 0.05 (2/15)"
     assert cells.loc["Move", "SAC"] == "0/15"
     assert not tables["ours"].bold.any()
-    bold = bold_cells(by_form(iou_per_task(gather(folder, "variant=1,2,3,4")))["ours"])
+    bold = bold_cells(by_form(iou_tables(gather(folder, "variant=1,2,3,4"), "task"))["ours"])
     assert bold.loc["Rope"].to_list() == [False, False, False, False, True, False, False]
 
 
@@ -125,7 +124,7 @@ def test_distances_are_means_of_the_runs_that_have_them(tmp_path: Path) -> None:
 
 
 def test_differences_and_rows_per_configuration(folder: Path) -> None:
-    data = by_form(iou_per_task(gather(folder)))["comparison"].data.set_index(["task", "method"])
+    data = by_form(iou_tables(gather(folder), "task"))["comparison"].data.set_index(["task", "method"])
     # Over the variants that both have; the paper's PPO on Move: 0.72 and 0.60 in variants 1 and 2.
     row = data.loc[("Move", "ppo")]
     assert row["difference"] == pytest.approx((0.4 - 0.72 + 0.5 - 0.60) / 2)
@@ -133,7 +132,7 @@ def test_differences_and_rows_per_configuration(folder: Path) -> None:
     row = data.loc[("Rope", "adam")]
     assert row["low"] < row["difference"] < row["high"]
     assert row["difference"] == pytest.approx(row["mean"] - np.mean([0.66, 0.71, 0.52, 0.37, 0.70]))
-    tables = by_form(iou_per_configuration(gather(folder)))
+    tables = by_form(iou_tables(gather(folder), "configuration"))
     assert tables["ours"].cells.shape == (50, 8) and len(tables["comparison"].cells) == 300
     row = tables["ours"].data.set_index(["task", "variant", "method"]).loc[("Rope", "3", "adam_h")]
     assert row["mean"] == pytest.approx(0.33) and row["runs"] == 3
@@ -173,7 +172,7 @@ def test_mixed_settings_are_refused_with_advice(tmp_path: Path) -> None:
     runs = gather(tmp_path, f"{key}=0.5")
     assert len(runs.table) == 1
     assert runs.unusual == [f"method.iterations = {synthetic.ROWS}", f"{key} = 0.5"]
-    assert f"{key} = 0.5" in by_form(iou_per_task(runs))["ours"].notes[-1]
+    assert f"{key} = 0.5" in by_form(iou_tables(runs, "task"))["ours"].notes[-1]
     # Two runs of one seed.
     save(tmp_path, {key: 0.5, "sim.device": "cuda"}, seed=1)
     with pytest.raises(ArgumentError, match=r"same seed.* sim\.device="):
@@ -216,7 +215,7 @@ def test_protocols_are_not_mixed(tmp_path: Path) -> None:
     assert (len(ours.table), ours.protocol) == (1, "plab")
     assert (len(theirs.table), theirs.protocol) == (1, "release")
     assert ours.unusual == theirs.unusual == [f"method.iterations = {synthetic.ROWS}"]
-    notes = by_form(iou_per_task(theirs))["ours"].notes
+    notes = by_form(iou_tables(theirs, "task"))["ours"].notes
     assert "Protocol: release." in notes and "protocol's own" in notes[-1]
     save(tmp_path / "other", released | {"protocol.floor": "plab"})
     assert "protocol.floor = plab" in gather(tmp_path / "other").unusual
@@ -231,7 +230,7 @@ def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> N
     assert runs.methods[3:6] == ["adam lr=0.01", "adam lr=0.1", "gd"]
     assert look("adam lr=0.1").label == "Adam, lr 0.1"
     assert look("adam lr=0.1").colour != look("adam lr=0.01").colour
-    tables = by_form(iou_per_task(runs))
+    tables = by_form(iou_tables(runs, "task"))
     shown = tables["ours"].cells.iloc[0]
     assert (shown["Adam, lr 0.01"], shown["Adam, lr 0.1"]) == ("0.80 ± 0.00", "0.40 ± 0.00")
     # Both are compared with what the paper has for the method; the key is no setting that needs a note.

@@ -10,11 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from plab.config.suite import PAPER_SEEDS
 from plab.results import ResultsError
-
-PAPER_SEED_COUNT = len(PAPER_SEEDS)
-"""Number of runs per configuration in the paper."""
 
 
 def paper_table(name: str) -> pd.DataFrame:
@@ -47,7 +43,7 @@ class Benchmark:
 SPEED = Benchmark(
     "speed.csv",
     "plab bench speed --paper --csv {file}",
-    ("task", "device", "batch", "forward_ms", "gradient_ms"),
+    ("task", "device", "precision", "batch", "forward_ms", "gradient_ms"),
 )
 ACCURACY = Benchmark(
     "accuracy.csv",

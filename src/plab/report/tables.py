@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 from plab.config.families import GRADIENT, RL
-from plab.config.suite import SUITE_VARIANTS, shipped_file
+from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, shipped_file
 from plab.report.collect import Runs
 from plab.report.methods import method
-from plab.report.reference import PAPER_SEED_COUNT, origin, paper_table
+from plab.report.reference import origin, paper_table
 from plab.report.statistics import (
     BUDGETS,
     CONFIDENCE,
@@ -83,8 +83,7 @@ def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
 
 def aligned(cells: pd.DataFrame) -> list[str]:
     """Return the alignment of each column: ``r`` for numbers, otherwise ``l``."""
-    columns = ([str(text) for text in cells.iloc[:, k]] for k in range(cells.shape[1]))
-    known = ([text for text in texts if text not in ("", NOTHING)] for texts in columns)
+    known = ([text for text in own if text not in ("", NOTHING)] for _, own in cells.astype(str).items())
     return ["r" if texts and all(map(_NUMBER.match, texts)) else "l" for texts in known]
 
 
@@ -126,11 +125,8 @@ def compare(runs: Runs, unit: str) -> pd.DataFrame:
     """
     groups = runs.table.groupby(["task", "variant", "method"])["score"]
     scores = {key: own.to_numpy(float) for key, own in groups}
-    whole, single, nothing = (
-        _paper_scores("iou_per_task"),
-        _paper_scores("iou_per_configuration"),
-        summarise([]),
-    )
+    whole, single = _paper_scores("iou_per_task"), _paper_scores("iou_per_configuration")
+    nothing = summarise([])
     units = [runs.variants] if unit == "task" else [[variant] for variant in runs.variants]
     rows = []
     for task, variants, name in itertools.product(ordered_tasks(runs.tasks), units, runs.methods):
@@ -151,13 +147,13 @@ def compare(runs: Runs, unit: str) -> pd.DataFrame:
 @functools.cache
 def _paper_scores(name: str) -> Mapping[tuple[str, ...], Summary]:
     """Return the paper's scores by task, variant (if the table has variants) and method."""
-    count = PAPER_SEED_COUNT * (len(SUITE_VARIANTS) if name == "iou_per_task" else 1)
+    count = len(PAPER_SEEDS) * (len(SUITE_VARIANTS) if name == "iou_per_task" else 1)
     rows = paper_table(name).itertuples(index=False, name=None)
     return {tuple(key): Summary(mean, std, count) for *key, mean, std in rows}
 
 
 def _in_paper(name: str) -> bool:
-    return any(key[-1] == (method(name).of or name) for key in _paper_scores("iou_per_task"))
+    return (method(name).of or name) in PAPER_METHODS
 
 
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:
@@ -171,33 +167,54 @@ def settings_note(runs: Runs) -> list[str]:
     protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
     if not runs.unusual:
         return protocol
-    shown = list(map(str, runs.unusual[:6]))
-    more = len(runs.unusual) - len(shown)
+    shown, more = runs.unusual[:6], len(runs.unusual) - 6
     other = "the protocol's own" if protocol else "plab's own"
     return [
         *protocol,
-        f"Settings other than {other}: {'; '.join(shown)}{f'; and {more} more' if more else ''}.",
+        f"Settings other than {other}: {'; '.join(shown)}{f'; and {more} more' if more > 0 else ''}.",
     ]
 
 
-def format_interval(interval: Interval, decimals: int = 2) -> str:
+def format_interval(interval: Interval) -> str:
     """Format an interval; missing intervals become a dash."""
     if np.isnan(interval.low):
         return NOTHING
-    return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
+    return f"[{number(interval.low, sign=True)}, {number(interval.high, sign=True)}]"
 
 
 # -------------------------------------------------------------------------------------------- incremental IoU
 
 
-def iou_per_task(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per task and method: ours, and compared with the paper's."""
-    return _iou_tables(runs, "task", "over variants and seeds")
+def iou_tables(runs: Runs, unit: str) -> list[Table]:
+    """Return normalised incremental IoU by method: ours, and compared with the paper's.
 
-
-def iou_per_configuration(runs: Runs) -> list[Table]:
-    """Return normalised incremental IoU per configuration and method: ours, and compared with the paper's."""
-    return _iou_tables(runs, "configuration", "over seeds")
+    Args:
+        runs: Our runs.
+        unit: ``task``, or ``configuration`` for a row per variant.
+    """
+    name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
+    keys = ["task"] if unit == "task" else ["task", "variant"]
+    data = compare(runs, unit)
+    data["text"] = list(map(_text, data["mean"], data["std"], data["runs"], data["expected"]))
+    # Rows of a line are in the order of methods.
+    lines = [own for _, own in data.groupby(keys, sort=False)]
+    labels = [*keys, *(method(m).label for m in runs.methods)]
+    shown = pd.DataFrame([[*own[keys].iloc[0], *own["text"]] for own in lines], columns=labels)
+    bold = np.array([[False] * len(keys) + _best(own) for own in lines])
+    ours = data[[*keys, "method", "mean", "std", "runs", "expected"]]
+    common = data[data["method"].map(_in_paper)]
+    papers = list(map(_text, common["paper_mean"], common["paper_std"], common["paper_runs"]))
+    gaps = [Interval(*own) for own in common[["difference", "low", "high"]].itertuples(index=False)]
+    compared = common[keys].assign(method=[method(m).label for m in common["method"]], plab=common["text"])
+    compared = compared.assign(paper=papers, difference=[number(gap.value, sign=True) for gap in gaps])
+    compared[INTERVAL] = list(map(format_interval, gaps))
+    mean = f"Mean ± standard deviation over {'variants and seeds' if unit == 'task' else 'seeds'}."
+    notes, other = [mean, _BOLD, _INCOMPLETE, *settings_note(runs)], [_DIFFERENCE, *settings_note(runs)]
+    numbers = common.drop(columns="text")
+    return [
+        Table(name, "ours", f"{title}, plab", shown, ours, bold, notes, len(shown) > 60),
+        Table(name, "comparison", f"{title}, compared", compared, numbers, None, other, True),
+    ]
 
 
 def distances(runs: Runs) -> list[Table]:
@@ -217,33 +234,6 @@ def distances(runs: Runs) -> list[Table]:
     notes = ["Mean ± standard deviation over variants and seeds [domain units].", *settings_note(runs)]
     title = "Distance of the final shape from the target, plab"
     return [Table("distances", "ours", title, cells, pd.DataFrame(data), None, notes)] if shown else []
-
-
-def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
-    """Return both forms of a score table; ``what`` describes the runs behind means and spreads."""
-    name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
-    keys = ["task"] if unit == "task" else ["task", "variant"]
-    data = compare(runs, unit)
-    data["text"] = list(map(_text, data["mean"], data["std"], data["runs"], data["expected"]))
-    # Rows of a line are in the order of methods.
-    lines = [own for _, own in data.groupby(keys, sort=False)]
-    labels = [*keys, *(method(m).label for m in runs.methods)]
-    shown = pd.DataFrame([[*own[keys].iloc[0], *own["text"]] for own in lines], columns=labels)
-    bold = np.array([[False] * len(keys) + _best(own) for own in lines])
-    ours = data[[*keys, "method", "mean", "std", "runs", "expected"]]
-    common = data[data["method"].map(_in_paper)]
-    papers = list(map(_text, common["paper_mean"], common["paper_std"], common["paper_runs"]))
-    gaps = [Interval(*own) for own in common[["difference", "low", "high"]].itertuples(index=False)]
-    compared = common[keys].assign(method=[method(m).label for m in common["method"]], plab=common["text"])
-    compared = compared.assign(paper=papers, difference=[number(gap.value, sign=True) for gap in gaps])
-    compared[INTERVAL] = list(map(format_interval, gaps))
-    mean, settings = f"Mean ± standard deviation {what}.", settings_note(runs)
-    notes, other = [mean, _BOLD, _INCOMPLETE, *settings], [_DIFFERENCE, *settings]
-    numbers = common.drop(columns="text")
-    return [
-        Table(name, "ours", f"{title}, plab", shown, ours, bold, notes, len(shown) > 60),
-        Table(name, "comparison", f"{title}, compared", compared, numbers, None, other, True),
-    ]
 
 
 def _text(mean: float, std: float, count: int, expected: int = 0) -> str:
@@ -334,10 +324,9 @@ def overall_agreement(cells: pd.DataFrame) -> dict[str, float]:
         Number of ``cells``, ``correlation`` (NaN without variation), mean ``distance``, mean ``difference``,
         and the fraction ``agree``.
     """
-    varied = len(cells) > 1 and cells["ours"].std() > 0.0 and cells["paper"].std() > 0.0
     return {
         "cells": len(cells),
-        "correlation": cells["ours"].corr(cells["paper"]) if varied else float("nan"),
+        "correlation": cells["ours"].corr(cells["paper"]),
         "distance": cells["difference"].abs().mean(),
         "difference": cells["difference"].mean(),
         "agree": cells["agrees"].mean(),
@@ -358,7 +347,7 @@ def solvability(runs: Runs) -> list[Table]:
     columns = data[["score", "paper_mean", "paper_std"]].itertuples(index=False)
     # A replay has no spread, so the interval is the paper's.
     sides = [
-        (Summary(score, 0.0, 2 * (score == score)), Summary(mean, std, PAPER_SEED_COUNT * (mean == mean)))
+        (Summary(score, 0.0, 2 * (score == score)), Summary(mean, std, len(PAPER_SEEDS) * (mean == mean)))
         for score, mean, std in columns
     ]
     gaps = [stratified_difference([ours], [theirs]) for ours, theirs in sides]
@@ -452,8 +441,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
             theirs = paper["forward_backward_ms"].get(task, nothing) if kind == _GRADIENT else nothing
             measured.append((task, kind, f"runs, {device}", ms, theirs))
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
-            where = [row["device"], *([row["precision"]] if "precision" in row else [])]
-            where = f"benchmark, {', '.join(where)}, batch {row['batch']}"
+            where = f"benchmark, {row['device']}, {row['precision']}, batch {row['batch']}"
             for column, kind, name in (
                 ("forward_ms", "forward", "forward_ms"),
                 ("gradient_ms", _GRADIENT, "forward_backward_ms"),

@@ -11,22 +11,10 @@ import numpy as np
 import pandas as pd
 
 import plab
+from plab.report import tables
 from plab.report.collect import Runs
 from plab.report.statistics import load_series
-from plab.report.tables import (
-    MINUS,
-    NOTHING,
-    Table,
-    agreement,
-    aligned,
-    distances,
-    hyperparameters,
-    iou_per_configuration,
-    iou_per_task,
-    score_at_budget,
-    solvability,
-    timing,
-)
+from plab.report.tables import MINUS, NOTHING, Table, aligned
 from plab.results.run_file import replace_file
 
 if TYPE_CHECKING:
@@ -46,28 +34,28 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     Returns:
         The tables.
     """
-    tables = [
-        *iou_per_task(runs),
-        *iou_per_configuration(runs),
-        *distances(runs),
-        *agreement(runs),
-        *timing(runs, benchmark),
-        *solvability(runs),
-        *score_at_budget(runs, load_series(runs)),
-        *hyperparameters(),
+    written = [
+        *tables.iou_tables(runs, "task"),
+        *tables.iou_tables(runs, "configuration"),
+        *tables.distances(runs),
+        *tables.agreement(runs),
+        *tables.timing(runs, benchmark),
+        *tables.solvability(runs),
+        *tables.score_at_budget(runs, load_series(runs)),
+        *tables.hyperparameters(),
     ]
     made = _footer(runs, command)
-    for table in tables:
+    for table in written:
         path = out / table.file
         replace_file(path.with_suffix(".tex"), "".join(f"% {line}\n" for line in made) + latex(table))
         numbers = table.data.to_csv(index=False, lineterminator="\n")
         replace_file(path.with_suffix(".csv"), "".join(f"# {line}\n" for line in made) + numbers)
-    inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in tables)
+    inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in written)
     document = (Path(__file__).parent / "web/tables.tex").read_text(encoding="utf-8")
     replace_file(out / "tables.tex", document.replace("INPUTS", inputs))
-    replace_file(out / "tables.md", "\n".join([*map(markdown, tables), *(f"{line}  " for line in made), ""]))
+    replace_file(out / "tables.md", "\n".join([*map(markdown, written), *(f"{line}  " for line in made), ""]))
     replace_file(out / "runs.json", json.dumps(origin(runs, command), indent=1) + "\n")
-    return tables
+    return written
 
 
 def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:

@@ -11,9 +11,9 @@ from typing import Any
 import pandas as pd
 
 from plab.config.families import GRADIENT
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.report.methods import method
-from plab.report.reference import PAPER_SEED_COUNT, paper_table
+from plab.report.reference import paper_table
 from plab.report.statistics import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.submission import UNSEEN, Card, SubmissionError, read
@@ -143,7 +143,7 @@ def _paper() -> dict[str, Any]:
     protocol = (
         "protocol=release, the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
-        f"{PAPER_SEED_COUNT} seeds. Submissions are scored differently, so these numbers are not comparable "
+        f"{len(PAPER_SEEDS)} seeds. Submissions are scored differently, so these numbers are not comparable "
         "with those of other tables."
     )
     return _table("The paper's table", protocol, SUITE_VARIANTS, lines)
