@@ -282,6 +282,6 @@ def main(argv: Sequence[str]) -> None:
     table = measure_table(COLUMNS, found, output / "accuracy.csv")
     with style():
         drawings = diagrams(pd.DataFrame(table))
-    save(drawings, output, "plab bench accuracy")
+        save(drawings, output, "plab bench accuracy")
     for drawing in drawings:
         print(output / f"{drawing.name}.png")

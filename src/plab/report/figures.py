@@ -6,9 +6,8 @@ import io
 import itertools
 import json
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from plab.config.selection import lookup
 from plab.report.collect import Runs
 from plab.report.methods import method
 from plab.report.reference import origin, paper_table
-from plab.report.statistics import Rows, Series, band, improvement, interquartile_mean, shared_strata
+from plab.report.statistics import Series, Strata, band, improvement, interquartile_mean, shared_strata
 from plab.report.tables import (
     AGREES,
     TOLERANCE,
@@ -59,11 +58,9 @@ class Drawing:
     numbers: dict[str, Any] = field(default_factory=dict)
 
 
-@contextmanager
-def style() -> Iterator[None]:
+def style() -> AbstractContextManager[None]:
     """Use plab's Matplotlib style inside the ``with`` block."""
-    with matplotlib.rc_context(fname=Path(__file__).with_name("plab.mplstyle")):
-        yield
+    return matplotlib.rc_context(fname=Path(__file__).with_name("plab.mplstyle"))
 
 
 def grid(rows: int, columns: int, *, width: float = 2.1, height: float = 1.7) -> tuple[Figure, np.ndarray]:
@@ -93,7 +90,8 @@ def legend(figure: Figure, columns: int | None = None) -> None:
 
 
 def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
-    """Write each figure as PDF and PNG, and ``figures.json`` with their notes and numbers.
+    """Write each figure as PDF and PNG, and ``figures.json`` with their notes and numbers; must be called
+    within :func:`style`.
 
     Args:
         drawings: The figures.
@@ -102,15 +100,14 @@ def save(drawings: Sequence[Drawing], folder: Path, made: str) -> None:
     """
     # Without the time of day the same runs give the same bytes.
     metadata = {"pdf": {"CreationDate": None, "Subject": made}, "png": {"Description": made}}
-    with style():
-        for drawing in drawings:
-            # Compute the layout once, because it takes longer than drawing for fifty panels.
-            drawing.figure.draw_without_rendering()
-            drawing.figure.set_layout_engine("none")
-            for form, own in metadata.items():
-                content = io.BytesIO()
-                drawing.figure.savefig(content, format=form, metadata=own)
-                replace_file(folder / f"{drawing.name}.{form}", content.getvalue())
+    for drawing in drawings:
+        # Compute the layout once, because it takes longer than drawing for fifty panels.
+        drawing.figure.draw_without_rendering()
+        drawing.figure.set_layout_engine("none")
+        for form, own in metadata.items():
+            content = io.BytesIO()
+            drawing.figure.savefig(content, format=form, metadata=own)
+            replace_file(folder / f"{drawing.name}.{form}", content.getvalue())
     notes = {one.name: {"notes": one.notes, "numbers": one.numbers} for one in drawings}
     replace_file(folder / "figures.json", json.dumps(notes, indent=1) + "\n")
 
@@ -126,46 +123,39 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         "Values below zero count as zero, as in the paper.",
         *settings_note(runs),
     ]
-
     tasks = [task for task in ordered_tasks(runs.tasks) if task in set(runs.table["task"])]
     columns = min(len(tasks), 5)
     # Panels are larger if there are few.
     few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
-    figures = {
-        "reward_per_task": grid(-(-len(tasks) // columns), columns, **few),
-        "reward_per_configuration": grid(len(tasks), len(runs.variants), width=1.6, height=1.25),
-    }
-    names: list[list[tuple[str, ...]]] = [[(task,) for task in tasks]]
-    names.append(list(itertools.product(tasks, runs.variants)))
-    for (figure, axes), shown in zip(figures.values(), names, strict=True):
-        for panel in axes.flat[len(shown) :]:
+    per_task = grid(-(-len(tasks) // columns), columns, **few)
+    per_configuration = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
+    drawings = []
+    for name, (figure, axes), keys in (
+        ("reward_per_task", per_task, [(task,) for task in tasks]),
+        ("reward_per_configuration", per_configuration, list(itertools.product(tasks, runs.variants))),
+    ):
+        for panel in axes.flat[len(keys) :]:
             panel.set_visible(False)
-        for panel, own in zip(axes.flat, shown, strict=False):
-            panel.set_title("-v".join(own))
-            _rewards(panel, runs, _pick(series, **dict(zip(("task", "variant"), own, strict=False))))
+        for panel, key in zip(axes.flat, keys, strict=False):
+            panel.set_title("-v".join(key))
+            own = [one for one in series if (one[0]["task"], one[0]["variant"])[: len(key)] == key]
+            _rewards(panel, runs, own)
         figure.supxlabel("episodes", fontsize=8)
         figure.supylabel("reward", fontsize=8)
         legend(figure)
-    return [Drawing(name, figure, notes) for name, (figure, _) in figures.items()]
+        drawings.append(Drawing(name, figure, notes))
+    return drawings
 
 
-def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
-    """Return the rows of the requested runs, by method."""
-    found: dict[str, list[Rows]] = defaultdict(list)
-    for names, table in series:
-        if all(names[key] == value for key, value in which.items()):
-            found[names["method"]].append(table)
-    return found
-
-
-def _rewards(panel: Axes, runs: Runs, tables: Mapping[str, list[Rows]]) -> None:
+def _rewards(panel: Axes, runs: Runs, series: Series) -> None:
     """Draw mean and spread of the reward of all methods against episodes."""
     for name in runs.methods:
-        if (one := band(tables.get(name, []), "episodes", "reward")) is not None:
+        tables = [table for names, table in series if names["method"] == name]
+        if (one := band(tables, "episodes", "reward")) is not None:
             look, low = method(name), (one.mean - one.std).clip(0.0)
             panel.plot(one.x, one.mean, color=look.colour, linestyle=look.dashes, label=look.label)
             panel.fill_between(one.x, low, one.mean + one.std, color=look.colour, alpha=0.18, linewidth=0)
-    panel.set(ylim=(0.0, None), xscale="log" if tables else "linear")
+    panel.set(ylim=(0.0, None), xscale="log" if series else "linear")
 
 
 # ----------------------------------------------------------------------------------------------- final scores
@@ -239,47 +229,41 @@ def aggregates(runs: Runs) -> list[Drawing]:
     """Return interquartile means and probabilities of improvement."""
     strata, notes = shared_strata(runs)
     notes += settings_note(runs)
-    return [draw(list(strata), strata, notes) for draw in (_interquartile_means, _improvements) if strata]
+    return [_interquartile_means(strata, notes), _improvements(strata, notes)] if strata else []
 
 
-Strata = Mapping[str, Sequence[np.ndarray]]
-
-
-def _interquartile_means(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
-    figure, panel = single(width=4.2, height=0.3 * len(methods) + 0.4)
+def _interquartile_means(strata: dict[str, Strata], notes: list[str]) -> Drawing:
+    figure, panel = single(width=4.2, height=0.3 * len(strata) + 0.4)
     numbers = {}
-    for position, name in enumerate(methods):
-        found = interquartile_mean(strata[name])
+    for position, (name, scores) in enumerate(strata.items()):
+        found = interquartile_mean(scores)
         numbers[name] = vars(found)
         reach = [[max(found.value - found.low, 0.0)], [max(found.high - found.value, 0.0)]]
         panel.errorbar(found.value, position, xerr=reach, fmt="o", color=method(name).colour, capsize=3)
-    panel.set_yticks(range(len(methods)), [method(name).label for name in methods])
+    panel.set_yticks(range(len(strata)), [method(name).label for name in strata])
     panel.set(
-        ylim=(len(methods) - 0.5, -0.5),
+        ylim=(len(strata) - 0.5, -0.5),
         xlim=(0.0, 1.0),
         xlabel="interquartile mean of the normalised incremental IoU",
     )
     return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
 
 
-def _improvements(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
-    labels = [method(name).label for name in methods]
-    figure, panel = single(width=0.62 * len(methods) + 1.2, height=0.45 * len(methods) + 0.6)
+def _improvements(strata: dict[str, Strata], notes: list[str]) -> Drawing:
+    labels = [method(name).label for name in strata]
+    figure, panel = single(width=0.62 * len(strata) + 1.2, height=0.45 * len(strata) + 0.6)
     numbers = {}
-    values = np.full((len(methods),) * 2, np.nan)
-    for i, one in enumerate(methods):
-        for j, other in enumerate(methods):
-            if i == j:
-                continue
-            found = improvement(strata[one], strata[other])
-            numbers[f"{one} over {other}"] = vars(found)
-            values[i, j] = found.value
-            text = f"{found.value:.2f}\n[{found.low:.2f}, {found.high:.2f}]"
-            shade = "white" if abs(found.value - 0.5) > 0.3 else "black"
-            panel.text(j, i, text, ha="center", va="center", fontsize=5.5, color=shade)
+    values = np.full((len(strata),) * 2, np.nan)
+    for (i, one), (j, other) in itertools.permutations(enumerate(strata), 2):
+        found = improvement(strata[one], strata[other])
+        numbers[f"{one} over {other}"] = vars(found)
+        values[i, j] = found.value
+        text = f"{found.value:.2f}\n[{found.low:.2f}, {found.high:.2f}]"
+        shade = "white" if abs(found.value - 0.5) > 0.3 else "black"
+        panel.text(j, i, text, ha="center", va="center", fontsize=5.5, color=shade)
     panel.imshow(values, vmin=0.0, vmax=1.0, cmap="PuOr", aspect="auto")
-    panel.set_xticks(range(len(methods)), labels)
-    panel.set_yticks(range(len(methods)), labels)
+    panel.set_xticks(range(len(strata)), labels)
+    panel.set_yticks(range(len(strata)), labels)
     panel.set(xlabel="than a run of", ylabel="a run is better of")
     panel.grid(visible=False)
     what = "Probability that a run of the method on the left scores higher than one of the method below."

@@ -35,8 +35,6 @@ _STYLES = {
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
-# In the order of the paper, followed by other methods.
-_KNOWN = tuple(_STYLES[name] for name in dict.fromkeys((*PAPER_METHODS, *_STYLES)))
 
 
 def method(name: str) -> Method:
@@ -71,5 +69,5 @@ def part(name: str, key: str, value: str, place: int) -> str:
 def ordered(present: Iterable[str]) -> list[str]:
     """Return the paper's methods, then the other methods present, in the order of tables and legends."""
     others = set(present) - set(PAPER_METHODS)
-    known = [known.name for known in _KNOWN if known.name in others]
+    known = [name for name in _STYLES if name in others]
     return [*PAPER_METHODS, *known, *sorted(others - set(known))]

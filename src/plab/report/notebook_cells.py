@@ -18,8 +18,6 @@ from plab.report.tables import Table, aligned
 from plab.results import ResultsError
 from plab.results.examples import measurements, resolve
 
-_DPI = 180
-
 
 def find_runs(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
     """Find the runs; show a message if there are none.
@@ -74,7 +72,7 @@ def show_figure(drawing: Drawing | None) -> None:
         return
     content = io.BytesIO()
     with style():
-        drawing.figure.savefig(content, format="png", dpi=_DPI)
+        drawing.figure.savefig(content, format="png", dpi=180)
     width = int(drawing.figure.get_figwidth() * 110)
     display(Image(content.getvalue(), width=width, alt=drawing.name))
     display(HTML(f'<p class="note">{escape(" ".join(drawing.notes))}</p>'))

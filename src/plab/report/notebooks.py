@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from plab.progress import Report
 from plab.report.page import asset, render
 from plab.results import ResultsError
 from plab.results.run_file import replace_file
@@ -25,19 +26,13 @@ def notebook_folder() -> Path:
     return own if own.is_dir() else package.parents[1] / "reports"
 
 
-def execute(
-    names: Sequence[str], parameters: Mapping[str, Any], out: Path, report: Callable[[int, str], None]
-) -> list[Path]:
-    """Execute notebooks, and write each as HTML and as a notebook with outputs.
+def execute(parameters: Mapping[str, Any], out: Path, report: Report) -> None:
+    """Execute all notebooks, and write each as HTML and as a notebook with outputs.
 
     Args:
-        names: Names among :data:`NOTEBOOKS`.
         parameters: Values for the names in the ``parameters`` cell of the notebooks.
         out: Folder to write to.
         report: Callback with the number of finished notebooks, and the name of the last one.
-
-    Returns:
-        The pages.
 
     Raises:
         plab.results.ResultsError: If a package is missing, or a notebook fails.
@@ -48,22 +43,20 @@ def execute(
     import nbformat
     from nbconvert import HTMLExporter
 
-    pages, style = [], asset("page.css") + asset("notebook.css")
-    for number, name in enumerate(names, start=1):
+    for number, name in enumerate(NOTEBOOKS, start=1):
         notebook = _executed(name, parameters)
         exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
-        values: dict[str, Any] = {
-            "body": exporter.from_notebook_node(notebook)[0],
-            "name": name,
-            "names": names,
-        }
-        html = render("notebook.html", style=style, script=asset("theme.js"), **values)
-        files = {"ipynb": nbformat.writes(notebook), "html": html}
-        for suffix, text in files.items():
-            replace_file(out / f"{name}.{suffix}", text)
-        pages.append(out / f"{name}.html")
+        html = render(
+            "notebook.html",
+            style=asset("page.css") + asset("notebook.css"),
+            script=asset("theme.js"),
+            body=exporter.from_notebook_node(notebook)[0],
+            name=name,
+            names=NOTEBOOKS,
+        )
+        replace_file(out / f"{name}.ipynb", nbformat.writes(notebook))
+        replace_file(out / f"{name}.html", html)
         report(number, name)
-    return pages
 
 
 def _executed(name: str, parameters: Mapping[str, Any]) -> Any:

@@ -103,10 +103,7 @@ class Page:
         pictures = {one.name: one.pictures(self._out) for one in self.shown}
         configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
         content = self._content | {"configurations": configurations}
-        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
-        # The only character that could end the enclosing script.
-        html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
-        replace_file(self._out / "index.html", html)
+        replace_file(self._out / "index.html", render("page.html", **self._values, content=content))
 
     def missing_pictures(self) -> dict[Path, tuple[Path, bool]]:
         """Return the folders of missing pictures, with the result file and whether there is a film."""
@@ -283,10 +280,11 @@ def render(template: str, package: str = _OWN, **values: Any) -> str:
     """Return a page.
 
     Args:
-        template: Template that extends ``base.html``.
+        template: Name of the template, which may extend ``base.html``.
         package: Package with the template in its folder ``web``.
         **values: Variables of the template.
     """
     loader = ChoiceLoader([PackageLoader(name, "web") for name in (package, _OWN)])
     environment = Environment(autoescape=True, undefined=StrictUndefined, loader=loader)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return environment.get_template(template).render(**values)

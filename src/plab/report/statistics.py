@@ -108,7 +108,7 @@ Strata = Sequence[np.ndarray]
 def interquartile_mean(strata: Strata) -> Interval:
     """Return the interquartile mean of all scores, with its percentile interval."""
     scores, rng = np.concatenate(strata), np.random.default_rng(_SEED)
-    samples = np.concatenate([_drawn(np.asarray(own), rng) for own in strata], axis=1)
+    samples = np.concatenate([_drawn(own, rng) for own in strata], axis=1)
     middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
     found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
     return _interval(*found)
@@ -136,16 +136,13 @@ def improvement(ours: Strata, theirs: Strata) -> Interval:
     return _interval(float(exact), np.mean(drawn, axis=0))
 
 
-_ENDS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
-
-
 def _drawn(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return bootstrap samples of one stratum, shape [sample, run]."""
     return scores[rng.integers(0, len(scores), (RESAMPLES, len(scores)))]
 
 
 def _interval(value: float, samples: np.ndarray) -> Interval:
-    low, high = np.quantile(samples, _ENDS)
+    low, high = np.quantile(samples, (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2))
     return Interval(float(value), float(low), float(high))
 
 
@@ -165,13 +162,10 @@ def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
     notes = [
         f"Over the {len(keys)} configurations with runs of all methods shown; runs per method: "
         f"{', '.join(counts)}.",
-        *(
-            [f"Not shown, because runs of these configurations are missing: {', '.join(apart)}."]
-            if apart
-            else []
-        ),
         f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
     ]
+    if apart:
+        notes.insert(1, f"Not shown, because runs of these configurations are missing: {', '.join(apart)}.")
     if any(len(scores) < 2 for own in strata.values() for scores in own):
         notes.append("Intervals do not include the spread of configurations with a single run.")
     return strata, notes
@@ -226,13 +220,11 @@ class Band:
         x: Abscissae, increasing, shape [point].
         mean: Mean over the runs, shape [point].
         std: Population standard deviation over the runs, shape [point].
-        count: Number of runs.
     """
 
     x: np.ndarray
     mean: np.ndarray
     std: np.ndarray
-    count: int
 
 
 def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
@@ -306,7 +298,7 @@ def band(
         # Evenly spread on a logarithmic axis.
         x = x[np.unique(np.searchsorted(x, np.geomspace(x[0], x[-1], points)).clip(max=len(x) - 1))]
     values = np.stack([np.interp(x, own, y if floor is None else np.maximum(y, floor)) for own, y in curves])
-    return Band(x, values.mean(axis=0), values.std(axis=0), len(curves))
+    return Band(x, values.mean(axis=0), values.std(axis=0))
 
 
 # ---------------------------------------------------------------------------------------------- equal budgets

@@ -75,12 +75,10 @@ def write_curves(runs: Runs, out: Path, command: str) -> list[Drawing]:
     drawings: list[Drawing] = []
     with figures.style():
         if len(runs.table):
-            drawings += [
-                *figures.rewards(runs, load_series(runs)),
-                *figures.rl_scores(runs),
-                *figures.agreement_plot(runs),
-                *figures.aggregates(runs),
-            ]
+            drawings += figures.rewards(runs, load_series(runs))
+            drawings += figures.rl_scores(runs)
+            drawings += figures.agreement_plot(runs)
+            drawings += figures.aggregates(runs)
         figures.save(drawings, out, " | ".join(_footer(runs, command)))
     replace_file(out / "runs.json", json.dumps(origin(runs, command), indent=1) + "\n")
     return drawings

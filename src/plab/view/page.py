@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 from collections.abc import Iterator, Sequence
 from importlib.metadata import files as installed_files
-from importlib.resources import files
 from typing import Any
 
 import k3d
 import numpy as np
 import pyvista as pv
-from jinja2 import Environment, StrictUndefined, Template
 
 from plab.render.camera import scene_camera
 from plab.render.renderer import BODY_COLORS, INK, MANIPULATOR_COLOR, PAPER, TARGET_COLOR
 from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import body_mesh, floor_lines, manipulator_parts, pose_matrix, target_mesh
+from plab.report.page import render
 
 _FRAMES = 60
 _POSITIONS = 600_000  # particles in all frames together: about 6 MB of the page
@@ -85,10 +83,11 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         "interpolate": not surface,
     }
     title = f"{recording.task}, variant {recording.variant}"
-    bar = _template("bar.html").render(
+    bar = render(
+        "bar.html",
+        "plab.view",
         title=title,
-        # The only character that could end the enclosing script.
-        content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
+        content=content,
         faded=[group for group in ("plasticine", "manipulators", "target") if group in groups],
     )
     head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
@@ -103,7 +102,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
 
 def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
     """Return an index of pages, given by name, file and score; the first page is open."""
-    return _template("gallery.html").render(pages=pages)
+    return render("gallery.html", "plab.view", pages=pages)
 
 
 def _plasticine(recording: RecordedRollout, steps: Sequence[int], *, surface: bool) -> Iterator[Any]:
@@ -151,11 +150,6 @@ def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
         roughness=0.6,
         group=group,
     )
-
-
-def _template(name: str) -> Template:
-    text = (files("plab.view") / "web" / name).read_text(encoding="utf-8")
-    return Environment(autoescape=True, undefined=StrictUndefined).from_string(text)
 
 
 def _number(color: str) -> int:
