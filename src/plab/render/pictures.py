@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,13 +73,11 @@ def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *,
             _save_mp4(recording, renderer, _SET_EVERY, folder / "end.mp4")
 
 
-@contextmanager
-def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> Iterator[Renderer]:
-    """Open a renderer whose camera shows a whole rollout."""
+def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> closing[Renderer]:
+    """Open a renderer whose camera shows a whole rollout, for a ``with`` block."""
     scene, mass = recording.scene, recording.target_mass
-    x, poses = recording.x[[0, -1]].reshape(-1, 3), recording.poses[::5]
-    with closing(Renderer(scene, mass, size, scene_camera(scene, mass, size, x, poses))) as renderer:
-        yield renderer
+    camera = scene_camera(scene, mass, size, recording.x[[0, -1]], recording.poses[::5])
+    return closing(Renderer(scene, mass, size, camera))
 
 
 # ---------------------------------------------------------------------------------------------------- formats

@@ -35,9 +35,8 @@ _METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25
 _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "smooth_shading": True}
 _MOVING_OPACITY = 0.8  # of manipulators, in front of the plasticine that they move
 _GHOST_OPACITY = 0.35
-_NEAR = (
-    0.01  # depth of the translucent target below its surface [domain units]; plasticine hides reached parts
-)
+# Depth of the translucent target below its surface [domain units], so that plasticine hides reached parts.
+_NEAR = 0.01
 _SHADOW = {"color": "#c5c0ba", "lighting": False}
 
 
@@ -68,10 +67,7 @@ class Renderer:
         self.camera = camera or scene_camera(scene, target_mass, size)
         self._parts = [manipulator_parts(manipulator) for manipulator in scene.manipulators]
         self._target = None if target_mass is None else target_mesh(scene, target_mass)
-        self._plotter: pv.Plotter | None = pv.Plotter(
-            off_screen=True, lighting="none", window_size=list(size)
-        )
-        plotter = self._plotter
+        plotter = self._plotter = pv.Plotter(off_screen=True, lighting="none", window_size=list(size))
         plotter.set_background(PAPER)
         plotter.enable_anti_aliasing("msaa", multi_samples=8)
         # VTK's order-independent transparency has no anti-aliasing.
@@ -105,14 +101,14 @@ class Renderer:
         """
         if np.shape(x) != (self._scene.particle_count, 3):
             raise ArgumentError(f"x has shape {np.shape(x)}, not {(self._scene.particle_count, 3)}")
-        plotter = self._set_up(poses, moving=True)
+        self._set_up(poses, moving=True)
         for number, mesh in enumerate(body_meshes(self._scene, np.asarray(x, np.float64))):
             self._add(mesh, f"body {number}", color=BODY_COLORS[number % len(BODY_COLORS)], **_CLAY)
         if self._target is not None:
             ghost = self._target.copy()
             ghost.points -= _NEAR * ghost.point_normals
             look = {"color": TARGET_COLOR, "opacity": _GHOST_OPACITY, "culling": "back"}
-            plotter.add_mesh(ghost, reset_camera=False, render=False, **look, **_GLASS)
+            self._plotter.add_mesh(ghost, reset_camera=False, render=False, **look, **_GLASS)
         return self._draw()
 
     def target(self, poses: np.ndarray) -> np.ndarray:
@@ -130,7 +126,7 @@ class Renderer:
             # PyVista reports errors for plotters that exist at interpreter shutdown.
             self._plotter = None
 
-    def _set_up(self, poses: np.ndarray, *, moving: bool) -> pv.Plotter:
+    def _set_up(self, poses: np.ndarray, *, moving: bool) -> None:
         """Clear the window, and add the floor and the manipulators, optionally including moving ones."""
         if self._plotter is None:
             raise RuntimeError("this renderer is closed: create a new one")
@@ -149,11 +145,9 @@ class Renderer:
                 mesh = part.mesh.transform(pose_matrix(pose, part.side), inplace=False)
                 name, opacity = f"manipulator {number} {part.side}", _MOVING_OPACITY if moves else 1.0
                 self._add(mesh, name, color=MANIPULATOR_COLOR, opacity=opacity, culling="back", **_METAL)
-        return self._plotter
 
     def _add(self, mesh: pv.PolyData, name: str, **look: Any) -> None:
         """Add a mesh and its shadow on the floor."""
-        assert self._plotter is not None
         self._plotter.add_mesh(mesh, name=name, reset_camera=False, render=False, **look)
         shadow = mesh.copy()
         shadow.points[:, 1] = np.maximum(shadow.points[:, 1], 0.0)
@@ -161,7 +155,6 @@ class Renderer:
         self._plotter.add_mesh(shadow, name=f"shadow of {name}", reset_camera=False, render=False, **_SHADOW)
 
     def _draw(self) -> np.ndarray:
-        assert self._plotter is not None
         self._plotter.renderer.ResetCameraClippingRange()
         self._plotter.render()
         return self._plotter.screenshot(return_img=True)

@@ -7,7 +7,7 @@ volume.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,20 +50,16 @@ class Part:
 def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     """Return the parts of a manipulator: the convex body of :attr:`ManipulatorShape.support`, or its own
     mesh."""
-    meshes: dict[str, Callable[..., pv.PolyData]] = {
-        "Chopsticks": lambda length, radius: _capsule(length, radius).translate((0.0, -length / 2, 0.0)),
-        "Torus": lambda major, minor: pv.ParametricTorus(
-            major, minor, u_res=_AROUND + 1, v_res=_ARC + 1
-        ).rotate_x(90.0),
-    }
-    own = meshes.get(manipulator.outline)
-    mesh = own(*manipulator.size) if own else _hull(manipulator)
+    if manipulator.outline == "Chopsticks":
+        length, radius = manipulator.size
+        shape = {"cylinder_length": length, "radius": radius, "resolution": _AROUND}
+        mesh = pv.Capsule(direction=(0.0, 1.0, 0.0), **shape).translate((0.0, -length / 2, 0.0))
+    elif manipulator.outline == "Torus":
+        mesh = pv.ParametricTorus(*manipulator.size, u_res=_AROUND + 1, v_res=_ARC + 1).rotate_x(90.0)
+    else:
+        mesh = _hull(manipulator)
     mesh = mesh.clean().compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=True)
     return [Part(mesh, side) for side in ((-0.5, 0.5) if manipulator.kind.grips else (0.0,))]
-
-
-def _capsule(length: float, radius: float) -> pv.PolyData:
-    return pv.Capsule(direction=(0.0, 1.0, 0.0), cylinder_length=length, radius=radius, resolution=_AROUND)
 
 
 def _hull(manipulator: Manipulator) -> pv.PolyData:
