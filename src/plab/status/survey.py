@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any
 
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
@@ -20,9 +20,6 @@ from plab.results.running import held
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""
-
-Key: TypeAlias = tuple[str, str, str, str]
-"""Task, variant, method and seed of a run."""
 
 _MISSING = {"state": "missing", "message": "", "score": math.nan, "done": 0, "total": 0, "rate": math.nan}
 _MISSING |= {"seconds": 0.0, "left": math.nan, "together": 1, "path": ""}
@@ -101,7 +98,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     found, unreadable = rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
-    keys = [cast(Key, tuple(str(row.values[name]) for name in NAMES)) for row in fitting]
+    keys = [tuple(str(row.values[name]) for name in NAMES) for row in fitting]
     runs = {key: dict(zip(NAMES, key, strict=True)) | _MISSING for key in _expected(keys, chosen, missing)}
     others = 0
     for key, row in zip(keys, fitting, strict=True):
@@ -115,8 +112,8 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     return Survey(_with_estimates(table), others, [str(error) for error in unreadable], protocol)
 
 
-def _expected(present: Iterable[Key], chosen: Selection, missing: bool) -> list[Key]:
-    """Return the requested runs, by task, method, variant and seed."""
+def _expected(present: Iterable[tuple[str, ...]], chosen: Selection, missing: bool) -> list[tuple[str, ...]]:
+    """Return task, variant, method and seed of each requested run, in the order of :class:`Survey`."""
     tasks, known = suite_tasks(), [[[part] for part in key] for key in set(present)]
     if missing or (not known and chosen.choices):
         methods, seeds = ({part for key in known for part in key[number]} for number in (2, 3))
@@ -125,10 +122,10 @@ def _expected(present: Iterable[Key], chosen: Selection, missing: bool) -> list[
     asked = (
         [chosen.choices.get(name, own) for name, own in zip(NAMES, values, strict=True)] for values in known
     )
-    keys = {cast(Key, key) for values in asked for key in itertools.product(*values)}
+    keys = {key for values in asked for key in itertools.product(*values)}
     order = {name: place for place, name in enumerate((*tasks, *PAPER_METHODS))}
 
-    def rank(key: Key) -> tuple[Any, ...]:
+    def rank(key: tuple[str, ...]) -> tuple[Any, ...]:
         task, variant, method, seed = key
         last = len(order)
         return order.get(task, last), task, order.get(method, last), method, variant, len(seed), seed
