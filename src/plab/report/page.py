@@ -61,7 +61,8 @@ class Page:
             for unit, keys in (("task", "task"), ("configuration", ["task", "variant"]))
         )
         tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
-        self._content = {
+        best = {one.name: one.best for one in self.shown}
+        content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
             "tasks": [{"task": task, "cells": by_task[task]} for task in tasks if task in with_runs],
             "gallery": [
@@ -73,16 +74,15 @@ class Page:
             ],
             "axes": list(AXES),
             "columns": list(_COLUMNS),
+            "configurations": [
+                {"name": f"{task}-v{variant}", "task": task, "variant": variant}
+                | {"best": best.get(f"{task}-v{variant}"), "cells": by_configuration[task, variant]}
+                for task in tasks
+                for variant in runs.variants
+            ],
         }
-        best = {one.name: one.best for one in self.shown}
-        self._configurations: list[dict[str, Any]] = [
-            {"name": f"{task}-v{variant}", "task": task, "variant": variant}
-            | {"best": best.get(f"{task}-v{variant}")}
-            | {"cells": by_configuration[task, variant]}
-            for task in tasks
-            for variant in runs.variants
-        ]
         self._values: dict[str, Any] = {
+            "content": content,
             "style": asset("page.css"),
             "script": "".join(map(asset, _SCRIPTS)),
             "methods": [method(name) for name in runs.methods],
@@ -101,9 +101,9 @@ class Page:
     def write(self) -> None:
         """Write ``index.html`` with the existing pictures."""
         pictures = {one.name: one.pictures(self._out) for one in self.shown}
-        configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
-        content = self._content | {"configurations": configurations}
-        replace_file(self._out / "index.html", render("page.html", **self._values, content=content))
+        for one in self._values["content"]["configurations"]:
+            one["pictures"] = pictures.get(one["name"], {})
+        replace_file(self._out / "index.html", render("page.html", **self._values))
 
     def missing_pictures(self) -> dict[Path, tuple[Path, bool]]:
         """Return the folders of missing pictures, with the result file and whether there is a film."""

@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,11 +63,6 @@ class Table:
     bold: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
     long: bool = False
-
-    @property
-    def file(self) -> Path:
-        """Path of the files below the folder of tables, without suffix."""
-        return Path(self.form) / self.name
 
 
 def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:

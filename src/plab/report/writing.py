@@ -46,11 +46,11 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     ]
     made = _footer(runs, command)
     for table in written:
-        path = out / table.file
+        path = out / table.form / table.name
         replace_file(path.with_suffix(".tex"), "".join(f"% {line}\n" for line in made) + latex(table))
         numbers = table.data.to_csv(index=False, lineterminator="\n")
         replace_file(path.with_suffix(".csv"), "".join(f"# {line}\n" for line in made) + numbers)
-    inputs = "\n".join(f"\\input{{{table.file.as_posix()}.tex}}" for table in written)
+    inputs = "\n".join(f"\\input{{{table.form}/{table.name}.tex}}" for table in written)
     document = (Path(__file__).parent / "web/tables.tex").read_text(encoding="utf-8")
     replace_file(out / "tables.tex", document.replace("INPUTS", inputs))
     replace_file(out / "tables.md", "\n".join([*map(markdown, written), *(f"{line}  " for line in made), ""]))
