@@ -22,7 +22,7 @@ from rich.table import Table
 from plab.cli.command import Parser, add_forms, add_sources, command_line, sources_and_words
 from plab.config.selection import select
 from plab.errors import ArgumentError, print_error
-from plab.status.survey import NAMES, STATES, Survey, survey
+from plab.status import NAMES, STATES, Survey, survey
 
 
 @command_line

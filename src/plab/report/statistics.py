@@ -245,9 +245,8 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
     return list(zip(names, found, strict=True))
 
 
-def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
+def rows_on_axes(config: Mapping[str, Any], rows: Rows) -> Rows:
     """Return the iterations of a loaded run, with the columns of :func:`load_series`."""
-    rows = {name: np.asarray(values) for name, values in iterations.items()}
     sim, known = config["sim"], known_family(config["method"]["family"])
     simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
     if known is not None and known.ranking == "score":

@@ -214,9 +214,8 @@ def iou_tables(runs: Runs, unit: str) -> list[Table]:
 def distances(runs: Runs) -> list[Table]:
     """Return the distances of final shapes from targets per task and method, or nothing."""
     shown, data = [], []
-    for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), DISTANCES):
-        if name not in runs.table:
-            continue
+    known = [name for name in DISTANCES if name in runs.table]
+    for task, name in itertools.product(ordered_tasks(list(set(runs.table["task"]))), known):
         own = runs.table[runs.table["task"] == task]
         found = {
             m: summarise(own.loc[own["method"] == m, name].dropna().to_numpy(float)) for m in runs.methods
