@@ -78,8 +78,8 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
         points = torch.from_numpy(points)
         return reference_mpm.signed_distance(manipulator, torch.from_numpy(pose), points)[0].numpy()
 
-    for part in shapes.manipulator_parts(manipulator):
-        mesh = part.mesh.transform(shapes.pose_matrix(pose, part.side), inplace=False)
+    for part, side in shapes.manipulator_parts(manipulator):
+        mesh = part.transform(shapes.pose_matrix(pose, side), inplace=False)
         assert np.abs(distance(mesh.points.astype(float))).max() < 1e-6
         faces = mesh.compute_normals(point_normals=False, auto_orient_normals=False)
         # Chords of arcs are a little inside; outwards is outside.

@@ -44,7 +44,7 @@ body = Body("box", (0.5, 0.1, 0.5), (0.2, 0.2, 0.2), 200)
 scene = Scene("disc", (body,), (tool,), grid_size=16, substeps=5, dt=4e-4, horizon=4)
 errors = check_gradient(make_terms({"contact": 1.0}, {"contact": "soft"})[0], [scene])
 assert max(errors.values()) < 1e-6, errors
-assert abs(manipulator_parts(tool)[0].mesh.points).max(axis=0).round(6).tolist() == [0.09, 0.03, 0.09]
+assert abs(manipulator_parts(tool)[0][0].points).max(axis=0).round(6).tolist() == [0.09, 0.03, 0.09]
 """
 
 

@@ -79,13 +79,12 @@ def test_the_page_holds_particles_and_manipulators_of_every_frame(recording, pag
     assert list(shown) == [0, 1, 2, 3]
     for step, x in shown.items():
         assert x.reshape(-1, 3) == pytest.approx(recording.x[step], abs=0.51 / 2**16)
-    parts = [
-        (k, part) for k, m in enumerate(recording.scene.manipulators) for part in shapes.manipulator_parts(m)
-    ]
+    tools = enumerate(recording.scene.manipulators)
+    parts = [(k, side) for k, m in tools for _, side in shapes.manipulator_parts(m)]
     assert len(parts) == 3
-    for thing, (number, part) in zip(things(page)["manipulators"], parts, strict=True):
+    for thing, (number, side) in zip(things(page)["manipulators"], parts, strict=True):
         for step, matrix in frames(thing["model_matrix"]).items():
-            expected = shapes.pose_matrix(recording.poses[step, number], part.side)
+            expected = shapes.pose_matrix(recording.poses[step, number], side)
             assert matrix.reshape(4, 4) == pytest.approx(expected, abs=1e-6)
 
 

@@ -65,13 +65,15 @@ def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
 def _frames(recording: RecordedRollout, every: int) -> Iterator[tuple[int, dict[str, pv.PolyData]]]:
     """Yield steps, and the surfaces of plasticine and manipulators by name."""
     scene, last = recording.scene, len(recording.x) - 1
-    parts = [(number, part) for number, m in enumerate(scene.manipulators) for part in manipulator_parts(m)]
+    parts = [(number, *part) for number, m in enumerate(scene.manipulators) for part in manipulator_parts(m)]
     with show_progress("export", 0, last) as report:
         for step in sorted({*range(0, last, every), last}):
             poses = recording.poses[step]
-            rigid = [p.mesh.transform(pose_matrix(poses[k], p.side), inplace=False) for k, p in parts]
+            rigid = [
+                (k, mesh.transform(pose_matrix(poses[k], side), inplace=False)) for k, mesh, side in parts
+            ]
             clay = _merged(enumerate(body_meshes(scene, recording.x[step])), "body")
-            tools = _merged(zip([k for k, _ in parts], rigid, strict=True), "manipulator")
+            tools = _merged(rigid, "manipulator")
             yield step, {"plasticine": clay, "manipulators": tools}
             report(step, "")
 

@@ -63,9 +63,9 @@ def scene_camera(
         poses = np.array([[[*m.position, *m.rotation, m.gap] for m in scene.manipulators]])
     seen = [(sample_particles(scene) if x is None else x).reshape(-1, 3)]
     for number, manipulator in enumerate(scene.manipulators):
-        for part in manipulator_parts(manipulator):
-            for matrix in (pose_matrix(pose, part.side) for pose in poses[:, number]):
-                seen.append(part.mesh.points @ matrix[:3, :3].T + matrix[:3, 3])
+        for mesh, side in manipulator_parts(manipulator):
+            for matrix in (pose_matrix(pose, side) for pose in poses[:, number]):
+                seen.append(mesh.points @ matrix[:3, :3].T + matrix[:3, 3])
     if target_mass is not None:
         seen.append(np.argwhere(target_mass > TARGET_MASS) * scene.dx)
     points = np.concatenate(seen)

@@ -141,10 +141,10 @@ class Renderer:
         self._plotter.add_mesh(lines, color=INK, reset_camera=False, render=False, **look)
         for number, (pose, own) in enumerate(zip(np.asarray(poses, np.float64), self._parts, strict=True)):
             moves = self._scene.manipulators[number].action_dim > 0
-            for part in own if moving or not moves else ():
-                mesh = part.mesh.transform(pose_matrix(pose, part.side), inplace=False)
-                name, opacity = f"manipulator {number} {part.side}", _MOVING_OPACITY if moves else 1.0
-                self._add(mesh, name, color=MANIPULATOR_COLOR, opacity=opacity, culling="back", **_METAL)
+            for mesh, side in own if moving or not moves else ():
+                placed = mesh.transform(pose_matrix(pose, side), inplace=False)
+                name, opacity = f"manipulator {number} {side}", _MOVING_OPACITY if moves else 1.0
+                self._add(placed, name, color=MANIPULATOR_COLOR, opacity=opacity, culling="back", **_METAL)
 
     def _add(self, mesh: pv.PolyData, name: str, **look: Any) -> None:
         """Add a mesh and its shadow on the floor."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import pyvista as pv
@@ -34,22 +33,14 @@ _NEARBY = 2.5  # width of the neighbourhood for the density of a target, in half
 _TARGET_LEVEL = 0.7  # relative to this density; exact for flat surfaces
 
 
-@dataclass(frozen=True)
-class Part:
-    """A rigid part of a manipulator.
+def manipulator_parts(manipulator: Manipulator) -> list[tuple[pv.PolyData, float]]:
+    """Return the rigid parts of a manipulator: the convex body of :attr:`ManipulatorShape.support`, or its
+    own mesh.
 
-    Attributes:
-        mesh: Surface in the manipulator's frame [domain units], with normals and sharp edges.
-        side: Offset along the local x axis, in gaps: +-1/2 for shapes that grip, otherwise 0.
+    Returns:
+        For each part its surface in the manipulator's frame [domain units], with normals and sharp edges, and
+        its side: the offset along the local x axis, in gaps, +-1/2 for shapes that grip, otherwise 0.
     """
-
-    mesh: pv.PolyData
-    side: float = 0.0
-
-
-def manipulator_parts(manipulator: Manipulator) -> list[Part]:
-    """Return the parts of a manipulator: the convex body of :attr:`ManipulatorShape.support`, or its own
-    mesh."""
     if manipulator.outline == "Chopsticks":
         length, radius = manipulator.size
         shape = {"cylinder_length": length, "radius": radius, "resolution": _AROUND}
@@ -59,7 +50,7 @@ def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     else:
         mesh = _hull(manipulator)
     mesh = mesh.clean().compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=True)
-    return [Part(mesh, side) for side in ((-0.5, 0.5) if manipulator.kind.grips else (0.0,))]
+    return [(mesh, side) for side in ((-0.5, 0.5) if manipulator.kind.grips else (0.0,))]
 
 
 def _hull(manipulator: Manipulator) -> pv.PolyData:
@@ -85,7 +76,7 @@ def _hull(manipulator: Manipulator) -> pv.PolyData:
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:
-    """Return the homogeneous matrix, shape [4, 4], from the frame of a part with a :attr:`Part.side` to the
+    """Return the homogeneous matrix, shape [4, 4], from the frame of a part on a side to the
     world, given the pose: position (3), quaternion w, x, y, z (4) and gap (1), shape [8]."""
     matrix = np.eye(4)
     # SciPy puts w last.

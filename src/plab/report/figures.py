@@ -151,10 +151,11 @@ def _rewards(panel: Axes, runs: Runs, series: Series) -> None:
     """Draw mean and spread of the reward of all methods against episodes."""
     for name in runs.methods:
         tables = [table for names, table in series if names["method"] == name]
-        if (one := band(tables, "episodes", "reward")) is not None:
-            look, low = method(name), (one.mean - one.std).clip(0.0)
-            panel.plot(one.x, one.mean, color=look.colour, linestyle=look.dashes, label=look.label)
-            panel.fill_between(one.x, low, one.mean + one.std, color=look.colour, alpha=0.18, linewidth=0)
+        if (drawn := band(tables, "episodes", "reward")) is not None:
+            look, (x, mean, std) = method(name), drawn
+            panel.plot(x, mean, color=look.colour, linestyle=look.dashes, label=look.label)
+            low, high = (mean - std).clip(0.0), mean + std
+            panel.fill_between(x, low, high, color=look.colour, alpha=0.18, linewidth=0)
     panel.set(ylim=(0.0, None), xscale="log" if series else "linear")
 
 

@@ -194,8 +194,7 @@ def _curve(
     drawn = band(iterations, axis, column, floor=floor, points=_POINTS)
     if drawn is None:
         return None
-    columns = (drawn.x, drawn.mean, drawn.std)
-    return [[float(f"{value:.{_DIGITS}g}") for value in values] for values in columns]
+    return [[float(f"{value:.{_DIGITS}g}") for value in values] for values in drawn]
 
 
 # --------------------------------------------------------------------------------------- pictures and films

@@ -212,21 +212,6 @@ Series = Sequence[tuple[dict[str, str], Rows]]
 """Task, variant, method and seed of each run, and its iterations."""
 
 
-@dataclass(frozen=True)
-class Band:
-    """Mean and spread of some runs' curves.
-
-    Attributes:
-        x: Abscissae, increasing, shape [point].
-        mean: Mean over the runs, shape [point].
-        std: Population standard deviation over the runs, shape [point].
-    """
-
-    x: np.ndarray
-    mean: np.ndarray
-    std: np.ndarray
-
-
 def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
     """Read the iterations of all runs.
 
@@ -267,7 +252,7 @@ def rows_on_axes(config: Mapping[str, Any], rows: Rows) -> Rows:
 
 def band(
     tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0, points: int = 400
-) -> Band | None:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return mean and standard deviation of a column over runs, on their common range; a solved run keeps its
     score.
 
@@ -279,7 +264,8 @@ def band(
         points: Maximum number of points of the band.
 
     Returns:
-        The band at the union of the runs' points, with linear interpolation; None without runs.
+        Abscissae, increasing, means and population standard deviations, shape [point] each, at the union of
+        the runs' points, with linear interpolation; None without runs.
     """
     pairs = ((np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables)
     curves = [(x, y) for x, y in pairs if len(x)]
@@ -297,7 +283,7 @@ def band(
         # Evenly spread on a logarithmic axis.
         x = x[np.unique(np.searchsorted(x, np.geomspace(x[0], x[-1], points)).clip(max=len(x) - 1))]
     values = np.stack([np.interp(x, own, y if floor is None else np.maximum(y, floor)) for own, y in curves])
-    return Band(x, values.mean(axis=0), values.std(axis=0))
+    return x, values.mean(axis=0), values.std(axis=0)
 
 
 # ---------------------------------------------------------------------------------------------- equal budgets

@@ -131,12 +131,11 @@ def _plasticine(recording: RecordedRollout, steps: Sequence[int], *, surface: bo
 
 def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
     for number, manipulator in enumerate(recording.scene.manipulators):
-        for part in manipulator_parts(manipulator):
-            poses = recording.poses[steps, number]
-            matrices = [pose_matrix(pose, part.side).astype(np.float32) for pose in poses]
-            mesh = _mesh(part.mesh, MANIPULATOR_COLOR, "manipulators")
-            mesh.model_matrix = {str(step): matrix for step, matrix in zip(steps, matrices, strict=True)}
-            yield mesh
+        for mesh, side in manipulator_parts(manipulator):
+            thing = _mesh(mesh, MANIPULATOR_COLOR, "manipulators")
+            poses = {str(step): pose_matrix(recording.poses[step, number], side) for step in steps}
+            thing.model_matrix = {step: matrix.astype(np.float32) for step, matrix in poses.items()}
+            yield thing
 
 
 def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
