@@ -24,9 +24,6 @@ from plab.results.run_file import replace_file
 STEPS_PER_SECOND = 20
 """Environment steps per second of a film."""
 
-SUFFIXES = (".png", ".gif", ".mp4")
-"""Suffixes of supported files: a strip of pictures, or a film."""
-
 _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
 _SET_EVERY = 2  # environment steps between frames of a set
@@ -35,10 +32,10 @@ _PAGE_SIZE = (480, 360)
 
 
 def check_output(path: Path) -> None:
-    """Raise RenderError if the suffix is not one of :data:`SUFFIXES`, or a package is not installed."""
+    """Raise RenderError if the suffix is not supported, or a package is not installed."""
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise RenderError(f"cannot write {path}: its suffix must be one of {', '.join(SUFFIXES)}")
+    if suffix not in _WRITERS:
+        raise RenderError(f"cannot write {path}: its suffix must be one of {', '.join(_WRITERS)}")
     if suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise RenderError("MP4 needs imageio-ffmpeg, which is not installed: pip install 'plab[render]'")
 
@@ -52,11 +49,10 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         size: Width and height of a frame [pixels]; even numbers for MP4.
         every: Environment steps between frames of a film.
     """
-    write = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}[path.suffix.lower()]
     # In another folder, so that the file appears complete.
     with _renderer(recording, size) as renderer, TemporaryDirectory() as place:
         fresh = Path(place, path.name)
-        write(recording, renderer, every, fresh)
+        _WRITERS[path.suffix.lower()](recording, renderer, every, fresh)
         replace_file(path, fresh.read_bytes())
 
 
@@ -119,6 +115,10 @@ def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: 
     except (OSError, RuntimeError):
         # ffmpeg may write only part of the film without reporting an error.
         raise OSError("the film is incomplete; the disk may be full") from None
+
+
+_WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
+"""Functions that write a strip of pictures, or a film, by suffix."""
 
 
 def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Iterator[np.ndarray]:

@@ -6,7 +6,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -233,7 +233,7 @@ def aggregates(runs: Runs) -> list[Drawing]:
     return [_interquartile_means(strata, notes), _improvements(strata, notes)] if strata else []
 
 
-def _interquartile_means(strata: dict[str, Strata], notes: list[str]) -> Drawing:
+def _interquartile_means(strata: Mapping[str, Strata], notes: list[str]) -> Drawing:
     figure, panel = single(width=4.2, height=0.3 * len(strata) + 0.4)
     numbers = {}
     for position, (name, scores) in enumerate(strata.items()):
@@ -250,7 +250,7 @@ def _interquartile_means(strata: dict[str, Strata], notes: list[str]) -> Drawing
     return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
 
 
-def _improvements(strata: dict[str, Strata], notes: list[str]) -> Drawing:
+def _improvements(strata: Mapping[str, Strata], notes: list[str]) -> Drawing:
     labels = [method(name).label for name in strata]
     figure, panel = single(width=0.62 * len(strata) + 1.2, height=0.45 * len(strata) + 0.6)
     numbers = {}

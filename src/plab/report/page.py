@@ -62,6 +62,12 @@ class Page:
         )
         tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
         best = {one.name: one.best for one in self.shown}
+        configurations: list[dict[str, Any]] = [
+            {"name": f"{task}-v{variant}", "task": task, "variant": variant}
+            | {"best": best.get(f"{task}-v{variant}"), "cells": by_configuration[task, variant]}
+            for task in tasks
+            for variant in runs.variants
+        ]
         content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
             "tasks": [{"task": task, "cells": by_task[task]} for task in tasks if task in with_runs],
@@ -74,12 +80,7 @@ class Page:
             ],
             "axes": list(AXES),
             "columns": list(_COLUMNS),
-            "configurations": [
-                {"name": f"{task}-v{variant}", "task": task, "variant": variant}
-                | {"best": best.get(f"{task}-v{variant}"), "cells": by_configuration[task, variant]}
-                for task in tasks
-                for variant in runs.variants
-            ],
+            "configurations": configurations,
         }
         self._values: dict[str, Any] = {
             "content": content,

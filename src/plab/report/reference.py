@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 import pandas as pd
@@ -21,8 +20,7 @@ def paper_table(name: str) -> pd.DataFrame:
             (the same without variant), ``timing`` (task, forward_ms, forward_backward_ms) or
             ``settings`` (method, key, value). Standard deviations are of the population.
     """
-    with (files("plab.report") / "paper" / f"{name}.csv").open(encoding="utf-8") as file:
-        return pd.read_csv(file, comment="#", dtype={"variant": str})
+    return pd.read_csv(Path(__file__).parent / f"paper/{name}.csv", comment="#", dtype={"variant": str})
 
 
 @dataclass(frozen=True)

@@ -286,13 +286,10 @@ def agreement(runs: Runs) -> list[Table]:
     if cells.empty:
         return []
     groups = [(method(name).label, own) for name, own in cells.groupby("method", sort=False)]
-    kinds = [
-        (f"all {kind}", own) for kind, own in cells.groupby(cells["method"].map(lambda n: method(n).kind))
-    ]
-    groups += kinds if len(kinds) > 1 else []
-    data = pd.DataFrame(
-        [{"method": label} | overall_agreement(own) for label, own in [*groups, ("all", cells)]]
-    )
+    by_kind = cells.groupby(cells["method"].map(lambda name: method(name).kind))
+    groups += [(f"all {kind}", own) for kind, own in by_kind] if len(by_kind) > 1 else []
+    groups.append(("all", cells))
+    data = pd.DataFrame([{"method": label} | overall_agreement(own) for label, own in groups])
     shown = pd.DataFrame(
         {
             "method": data["method"],
@@ -525,7 +522,7 @@ def _value(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_value(item) for item in value)}]"
     if value is None or isinstance(value, bool):
-        return "none" if value is None else str(value).lower()
+        return str(value).lower()
     try:
         # YAML parses 1e-8 as text.
         number = float(value)
