@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, make_batch
+from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, info_of, make_batch
 from plab.envs.observations import mapped
 from plab.errors import ArgumentError
 
@@ -107,16 +107,16 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         done = self.batch.step(np.asarray(actions), strict=False, idle=idle)
         observation, reward = done.observation, np.where(idle, 0.0, done.reward)
         terminated, truncated = done.terminated & ~idle, done.cut_off & ~idle
-        info = self._masked(done.info | self._failures(done.failures))
+        info = self._masked(done.info, done.failures)
         if idle.any():
             observation, info = self._restarted(idle)
         over = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and over.any():
-            last = np.full(self.num_envs, None, object)
+            ended: dict[str, Any] = {}
             for e in np.flatnonzero(over):
-                last[e] = mapped(operator.itemgetter(e), observation)
-            final = done.info | self._failures(done.failures)
-            ended = self._masked({"final_obs": last, "final_info": self._masked(final, over)}, over)
+                final = {"final_obs": mapped(operator.itemgetter(e), observation)}
+                final["final_info"] = info_of(done.info, e, done.failures)
+                ended = self._add_info(ended, final, e)
             observation, info = self._restarted(over)
             info = ended | info
         return observation, reward, terminated, truncated, info
@@ -124,7 +124,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state from :meth:`get_state`; return its observations and ``info``."""
         observation, info = self.batch.set_state(state)
-        return observation, self._masked(info | self._failures(self.batch.failures))
+        return observation, self._masked(info, self.batch.failures)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
@@ -141,25 +141,14 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def _restarted(self, mask: np.ndarray, **how: Any) -> tuple[Any, dict[str, Any]]:
         """Start the next episodes of some sub-environments; return observations and ``info`` of all."""
         observation, info = self.batch.reset(environments=None if mask.all() else np.flatnonzero(mask), **how)
-        return observation, self._masked(info)
+        return observation, self._masked(info, {})
 
-    def _failures(self, failures: Mapping[int, str]) -> dict[str, np.ndarray]:
-        texts = np.full(self.num_envs, None, object)
-        texts[list(failures)] = list(failures.values())
-        return {"failure": texts} if failures else {}
-
-    def _masked(self, info: Mapping[str, Any], mask: np.ndarray | None = None) -> dict[str, Any]:
-        """Add Gymnasium's masks of the sub-environments that have an entry; other entries are 0."""
+    def _masked(self, info: Mapping[str, Any], failures: Mapping[int, str]) -> dict[str, Any]:
+        """Add Gymnasium's masks of the sub-environments that have an entry, and the reasons of failures."""
         out: dict[str, Any] = {}
         for name, values in info.items():
-            own = np.ones(self.num_envs, bool) if mask is None else mask.copy()
-            if isinstance(values, Mapping):
-                out |= {name: self._masked(values, mask) if name == "randomized" else values, f"_{name}": own}
-                continue
-            if values.dtype == object:
-                own &= np.array([value is not None for value in values])
-            elif mask is not None:
-                values = values.copy()
-                values[~mask] = 0
-            out |= {name: values, f"_{name}": own}
+            own = self._masked(values, {}) if isinstance(values, Mapping) else values
+            out |= {name: own, f"_{name}": np.ones(self.num_envs, bool)}
+        for e, reason in failures.items():
+            out = self._add_info(out, {"failure": reason}, e)
         return out
