@@ -13,7 +13,7 @@ from plab.errors import ArgumentError
 _NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "target_mass"}
 
 
-class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray], np.ndarray]):
+class GoalEnv(gymnasium.ObservationWrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray]]):
     """Environment with the observations ``observation``, ``achieved_goal`` and ``desired_goal``.
 
     These are the state, and the current and target mass distributions on a coarse grid. Rewards are
@@ -35,18 +35,12 @@ class GoalEnv(gymnasium.Wrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.
         each cell, shape [..., cell, cell, cell]. ``info`` is ignored."""
         return -0.5 * np.abs(achieved_goal - desired_goal).sum(axis=(-3, -2, -1))
 
-    def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)
-        return self._goals(observation), info
-
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Advance by one step."""
-        observation, _, terminated, truncated, info = self.env.step(action)
-        seen = self._goals(observation)
+        seen, _, terminated, truncated, info = super().step(action)
         reward = self.compute_reward(seen["achieved_goal"], seen["desired_goal"], info)
         return seen, float(reward), terminated, truncated, info
 
-    @staticmethod
-    def _goals(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def observation(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return state and goals from an observation of the wrapped environment."""
         return {name: observation[own] for name, own in _NAMES.items()}
