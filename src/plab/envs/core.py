@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -21,7 +21,7 @@ from gymnasium.error import ResetNeeded
 from plab.config import Config, load_config, ranges
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
-from plab.envs.observations import Observer, Sensors, mapped, spaces
+from plab.envs.observations import Array, Observer, Sensors, mapped, spaces
 from plab.envs.randomization import EpisodeRandomizer, Stages, staged
 from plab.errors import ArgumentError
 from plab.objective import earth_movers_distances
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     import torch
 
     from plab.render import Renderer
-
-Array: TypeAlias = Any
-"""A NumPy array, or a CUDA tensor if the caller passed one."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 """Gymnasium's metadata of every environment; at 20 frames per second an episode takes 2.5 s."""
@@ -307,8 +304,9 @@ class EpisodeBatch:
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
             self.problem.refresh()
-            self._new_observer()
-        self._steps: np.ndarray | None = None
+            self._refresh_views()
+        # No step is left before the first reset.
+        self._steps = np.full(self.size, self.horizon)
         self._over = np.zeros(self.size, bool)
         # Environments with the same configuration have independent samples.
         ids = [id(cfg) for cfg in self.configs]
@@ -325,9 +323,7 @@ class EpisodeBatch:
         self.failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
         measured = self._measured()
-        # Of the initial states, unless they have changed since.
-        self._initial: tuple[Array, ...] | None = (self._observe(), *measured)
-        self._last = self._initial
+        self._last: tuple[Array, ...] = (self._observe(), *measured)
         self._initial_loss = Constants(self.problem.loss_of(self._last[1]))
 
     @property
@@ -348,24 +344,20 @@ class EpisodeBatch:
     def _simulator(self) -> Simulator:
         return self.problem.simulator
 
-    def _new_observer(self) -> None:
-        # Changes by the caller invalidate the observations of random scenes.
-        known = dict if self.changed_by_hand else self.randomizer.target_observations
-        self._observer = Observer(self.problem, self.configs[0], known)
-
     def _refresh_views(self) -> None:
         """Update observations and pictures after changes of scenes and targets."""
         self._close_renderers()
         self._sensors.refresh()
-        self._new_observer()
-        self._initial = None
+        # Changes by the caller invalidate the observations of random scenes.
+        known = dict if self.changed_by_hand else self.randomizer.target_observations
+        self._observer = Observer(self.problem, self.configs[0], known)
 
     def _follow_changes(self, *, keep: bool) -> None:
         """Begin again if the caller has changed scenes, targets or initial states; ``keep`` the episodes."""
         if self._simulator.changes != self._changes:
             state = self.get_state() if keep else None
             self.changed_by_hand += 1
-            self.randomizer.follow()
+            self.randomizer.follow(self.problem)
             if self._stages:
                 self._stages.follow(self.problem)
             self._begin_again()
@@ -423,23 +415,14 @@ class EpisodeBatch:
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
         drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}
-        changed = self.randomizer.put(drawn)
+        changed = self.randomizer.put(drawn, self.problem)
         if self._stages:
             changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers
-        if self._steps is None:
-            self._steps = np.zeros(self.size, int)
         self._steps[rows], self._over[rows] = 0, False
         self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
-        part = environments is not None or on_device(like)
-        if changed or self.randomizer.changed or part or self._initial is None:
-            self._restart(rows, like, changed)
-            self._initial = self._initial if part else self._last
-        else:
-            self._last = self._initial
-        # Copies, because callers may keep and modify them.
-        self._last = _copies(self._last)
+        self._restart(rows, like, changed)
         return self._shown()
 
     def _restart(self, rows: Sequence[int], like: Array, changed: bool) -> None:
@@ -460,21 +443,17 @@ class EpisodeBatch:
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
         """Store observations and measures, as arrays or CUDA tensors, except for some environments."""
 
-        def restore(table: Array, old: Array) -> None:
-            own = old[kept]
-            table[kept] = _tensor_like(table, own) if on_device(table) else _on_host(own)
-
         before, self._last = self._last, (observation, *measured)
         for table, old in zip(self._last, before, strict=True) if kept else ():
-            mapped(restore, table, old)
+            mapped(lambda new, known: _set_rows(new, kept, known[kept]), table, old)
 
     def require_running(self, idle: np.ndarray | bool = False) -> None:
         """Raise ResetNeeded if an episode has ended or diverged, except ``idle`` ones."""
         if np.any(self.over & ~np.asarray(idle)):
-            raise ResetNeeded("the episode is over: call reset() before step()")
+            raise ResetNeeded("the episode is over or has not started: call reset() before step()")
 
     @_alone
-    def step(self, actions: Array, *, strict: bool = True, idle: np.ndarray | None = None) -> Transition:
+    def step(self, actions: Array, *, strict: bool = True, idle: np.ndarray | bool = False) -> Transition:
         """Advance all sub-environments by one step.
 
         Args:
@@ -510,7 +489,7 @@ class EpisodeBatch:
         terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
         self._over = terminated | truncated
-        ended = np.flatnonzero(self._over if idle is None else self._over & ~idle)
+        ended = np.flatnonzero(self._over & ~np.asarray(idle))
         if self._transports and (rows := np.setdiff1d(ended, list(self.failures))).size:
             self._note_ends(rows, info)
         if self._stages:
@@ -565,7 +544,7 @@ class EpisodeBatch:
         computed with the current targets, which are also the observed ones."""
         self._simulator.set_state(state.simulation)
         self._follow_changes(keep=False)
-        changed = self.randomizer.put(dict(enumerate(state.values)))
+        changed = self.randomizer.put(dict(enumerate(state.values)), self.problem)
         if self._stages:
             self._stages.restore(state.stages, self.problem)
         if state.changed_by_hand != self.changed_by_hand:
@@ -582,7 +561,7 @@ class EpisodeBatch:
 
     def _shown(self) -> tuple[Any, dict[str, Any]]:
         """Return copies of the last observations, and ``info``."""
-        observation, *measured = _copies(self._last)
+        observation, *measured = (mapped(_copy, table) for table in self._last)
         return observation, self._info(*measured)
 
     @_alone
@@ -619,13 +598,11 @@ class EpisodeBatch:
         self._steps = taken + steps
         return terms
 
-    def _taken(self, steps: int = 1, idle: np.ndarray | None = None) -> np.ndarray:
+    def _taken(self, steps: int = 1, idle: np.ndarray | bool = False) -> np.ndarray:
         """Return the steps taken, shape [batch]; raise ResetNeeded if an episode has fewer left."""
-        if self._steps is None:
-            raise ResetNeeded("no episode has started: call reset() before step()")
         over = self._over | (self._steps + steps > self.horizon)
-        if np.any(over if idle is None else over & ~idle):
-            raise ResetNeeded("the episode is over: call reset() before step()")
+        if np.any(over & ~np.asarray(idle)):
+            raise ResetNeeded("the episode is over or has not started: call reset() before step()")
         return self._steps
 
     @_alone
@@ -647,7 +624,6 @@ class EpisodeBatch:
         self._close_renderers()
         self._problem = None
         self._sensors.release()
-        self.randomizer.release()
 
     def _close_renderers(self) -> None:
         for renderer in self._renderers:
@@ -655,13 +631,11 @@ class EpisodeBatch:
         self._renderers = []
 
     def _observe(self, like: Array = None) -> Any:
-        def state() -> Array:
-            seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
-            joined = self._observer(*seen, np.float32)
-            return joined.float() if on_device(joined) else joined
+        def state(like: Array) -> Array:
+            particles = self._simulator.observe(self._observer.stride, like)
+            return self._observer(particles, self._simulator.poses(like))
 
-        observation = self._sensors(state, like)
-        return observation if self._steps is None else self._noisy(observation, self._steps)
+        return self._noisy(self._sensors(state, like), self._steps)
 
     def _noisy(self, observation: Any, steps: np.ndarray) -> Any:
         """Add the sampled noise to observations."""
@@ -688,7 +662,7 @@ class EpisodeBatch:
         masses = self._simulator.mass_tensor()[rows], self.problem.target_mass[rows]
         distances = earth_movers_distances(*masses, torch.empty(0, device=self._simulator.device))
         for table in (info["earth_movers"], self._last[-1]["earth_movers"]):
-            table[rows] = _tensor_like(table, distances) if on_device(table) else _on_host(distances)
+            _set_rows(table, rows, distances)
 
     def _info(self, terms: Array, iou: Array, requested: Mapping[str, Array]) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
@@ -770,12 +744,11 @@ class Restorable:
         return self.batch.get_state()
 
 
-def _tensor_like(table: torch.Tensor, values: Array) -> torch.Tensor:
-    return values.to(table) if on_device(values) else table.new_tensor(values)
-
-
-def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:
-    return tuple(mapped(_copy, table) for table in tables)
+def _set_rows(table: Array, rows: Sequence[int] | np.ndarray, values: Array) -> None:
+    if on_device(table):
+        table[rows] = values.to(table) if on_device(values) else table.new_tensor(values)
+    else:
+        table[rows] = _on_host(values)
 
 
 def _copy(table: Array) -> Array:

@@ -55,9 +55,9 @@ class Observer:
             _target_observations(problem, known()) if cfg.observe_target else np.empty((size, 0))
         )
 
-    def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
+    def __call__(self, particles: Array, poses: Array) -> Array:
         """Return observations, shape [batch, entry], given particles, shape [batch, observed, 6], and all
-        poses, shape [batch, manipulator, 8]; ``dtype`` applies to arrays."""
+        poses, shape [batch, manipulator, 8]."""
         size = len(particles)
         rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
         rows.append(self._target.like(rows[0]))
@@ -66,7 +66,7 @@ class Observer:
             import torch
 
             return torch.cat(rows, dim=1)
-        return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
+        return np.concatenate(rows, axis=1)
 
     def pull_back(self, bar: Array) -> tuple[Array, Array]:
         """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
@@ -217,13 +217,13 @@ class Sensors:
         for sensor in self._cameras.values():
             sensor.refresh()
 
-    def __call__(self, state: Callable[[], Array], like: Array) -> Any:
+    def __call__(self, state: Callable[[Array], Array], like: Array) -> Any:
         """Return observations of the current states; ``state`` is a function that returns the observation of
         that name. If ``like`` is a CUDA tensor, so are the results."""
-        out = {
-            name: state() if source is None else _single(source(like))
-            for name, source in self._sources.items()
-        }
+        out = {}
+        for name, source in self._sources.items():
+            values = (source or state)(like)
+            out[name] = values.float() if on_device(values) else values.astype(np.float32)
         for name, sensor in self._cameras.items() if self._pictures else ():
             for picture, values in sensor.capture(*self._pictures, like=like).items():
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
@@ -278,10 +278,6 @@ class _OfTargets:
 
 def _unit(*shape: int) -> Box:
     return Box(0.0, 1.0, shape, np.float32)
-
-
-def _single(values: Array) -> Array:
-    return values.float() if on_device(values) else values.astype(np.float32)
 
 
 def coarse_shares(mass: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +81,6 @@ class EpisodeRandomizer:
         ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; raise ConfigError
         if a range is invalid.
         """
-        self._problem: Problem | None = problem
         self._cfgs = list(cfgs)
         self.values: list[Values] = [{} for _ in cfgs]
         unique = {id(cfg): cfg for cfg in cfgs}
@@ -105,13 +104,8 @@ class EpisodeRandomizer:
         """True if a sub-environment differs from its configuration."""
         return any(self.values)
 
-    def release(self) -> None:
-        """Release the simulator and its memory."""
-        self._problem = None
-
-    def follow(self) -> None:
+    def follow(self, problem: Problem) -> None:
         """Keep scenes and targets that the caller has set in the simulator, except for sampled values."""
-        problem = cast(Problem, self._problem)
         for e, (before, after) in enumerate(zip(problem.scenes, problem.simulator.scenes, strict=True)):
             if before is not after:
                 self._scenes[e] = _applied(self._scenes[e], before, after)
@@ -145,13 +139,12 @@ class EpisodeRandomizer:
                 known[e] = base.target_observation
         return known
 
-    def put(self, values: Mapping[int, Values]) -> bool:
+    def put(self, values: Mapping[int, Values], problem: Problem) -> bool:
         """Apply values to some sub-environments, in the simulator's scenes and targets; return whether
         anything differs from the previous episodes."""
         values = {e: own for e, own in values.items() if own != self.values[e]}
         if not values:
             return False
-        problem = cast(Problem, self._problem)
         scenes, particles, targets = list(problem.scenes), {}, {}
         for e, own in values.items():
             base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]

@@ -133,7 +133,7 @@ class IdentifyRunner(Runner):
         def depths(pictures: Any) -> np.ndarray:
             return np.concatenate([_block_depths(pictures[name], one) for name, one in names.items()], -1)
 
-        self._look = lambda: depths(sensors(lambda: None, self._actions))
+        self._look = lambda: depths(sensors(lambda like: like, self._actions))
         return depths(seen)[1:]
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
