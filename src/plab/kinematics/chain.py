@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -103,6 +103,9 @@ class Link:
     size: tuple[float, ...]
 
 
+Node = TypeVar("Node", Joint, Link)
+
+
 @dataclass(frozen=True)
 class Chain:
     """A kinematic tree in a scene.
@@ -125,13 +128,10 @@ class Chain:
 
     def frames(self, positions: Sequence[float]) -> np.ndarray:
         """Transforms from links to the world, shape [link, 4, 4], for joint positions, shape [joint]."""
-        world: list[np.ndarray] = []
-        for joint, position in zip(self.joints, positions, strict=True):
-            above = world[joint.parent] if joint.parent >= 0 else np.eye(4)
-            world.append(above @ joint.matrix(position))
-        return np.array(
-            [(world[k.parent] if k.parent >= 0 else np.eye(4)) @ np.array(k.offset) for k in self.links]
-        )
+        world = {-1: np.eye(4)}
+        for number, (joint, position) in enumerate(zip(self.joints, positions, strict=True)):
+            world[number] = world[joint.parent] @ joint.matrix(position)
+        return np.array([world[link.parent] @ np.array(link.offset) for link in self.links])
 
     def largest_step(self) -> float:
         """Upper bound of the displacement of any point of a link in an environment step [domain units]."""
@@ -176,24 +176,21 @@ class Chain:
                 can move.
         """
         turn = pose_matrix((0.0, 0.0, 0.0), rotation)
-        base = [
-            Joint(name, k - 1, IDENTITY_MATRIX, k >= 3, axis, low=-math.pi if k >= 3 else -1.0)
-            for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ())
-        ]
-        base = [replace(joint, high=-joint.low) for joint in base]
         place = pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
-        if base:
-            base[0] = replace(base[0], offset=_tuples(place))
+        base: list[Joint] = []
+        for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ()):
+            most = math.pi if k >= 3 else 1.0
+            offset = IDENTITY_MATRIX if k else _tuples(place)
+            base.append(Joint(name, k - 1, offset, k >= 3, axis, low=-most, high=most))
         first = turn if base else place @ turn
         shift = len(base)
 
-        def moved(node: Joint | Link) -> dict[str, Any]:
+        def moved(node: Node) -> Node:
             if node.parent >= 0:
-                return {"parent": node.parent + shift}
-            return {"parent": shift - 1, "offset": _tuples(first @ np.array(node.offset))}
+                return replace(node, parent=node.parent + shift)
+            return replace(node, parent=shift - 1, offset=_tuples(first @ np.array(node.offset)))
 
-        joints = base + [replace(joint, **moved(joint)) for joint in self.joints]
-        links = [replace(link, **moved(link)) for link in self.links]
+        joints = base + [moved(joint) for joint in self.joints]
         names = [joint.name for joint in joints]
         scales, starts = matched("scale", scale, names), matched("start", start, names)
         bounds = matched("limits", limits, names)
@@ -206,38 +203,33 @@ class Chain:
                     f"start: joint {joint.name} at {at:g} is outside its limits {low:g} .. {high:g}"
                 )
             joints[k] = replace(joint, low=low, high=high, start=at, scale=scales.get(joint.name, 0.0))
-        components = list(dict.fromkeys(shared.get(one.name, one.name) for one in joints if one.scale))
+        chain = Chain(tuple(joints), tuple(map(moved, self.links))).moving()
+        names = [shared.get(joint.name, joint.name) for joint in chain.joints]
+        components = tuple(dict.fromkeys(names))
         if not components:
             raise ModelError("scale: no joint moves; set the scale of at least one joint")
-        numbered = [
-            replace(one, component=components.index(shared.get(one.name, one.name)) if one.scale else 0)
-            for one in joints
-        ]
-        return Chain(tuple(numbered), tuple(links), tuple(components)).moving()
+        pairs = zip(chain.joints, names, strict=True)
+        numbered = tuple(replace(joint, component=components.index(name)) for joint, name in pairs)
+        return replace(chain, joints=numbered, components=components)
 
     def moving(self) -> Chain:
         """Copy of the chain without fixed joints."""
         kept: list[Joint] = []
         # For each joint: index of its new parent joint, and transform to its frame.
-        frames: list[tuple[int, np.ndarray]] = []
+        frames = {-1: (-1, np.eye(4))}
 
-        def below(node: Joint | Link) -> tuple[int, np.ndarray]:
-            parent, matrix = frames[node.parent] if node.parent >= 0 else (-1, np.eye(4))
-            return parent, matrix @ np.array(node.offset)
+        def attached(node: Node) -> Node:
+            parent, matrix = frames[node.parent]
+            return replace(node, parent=parent, offset=_tuples(matrix @ np.array(node.offset)))
 
-        for joint in self.joints:
-            parent, offset = below(joint)
-            moved = replace(joint, parent=parent, offset=_tuples(offset))
+        for number, joint in enumerate(self.joints):
+            moved = attached(joint)
             if joint.scale:
                 kept.append(moved)
-                frames.append((len(kept) - 1, np.eye(4)))
+                frames[number] = len(kept) - 1, np.eye(4)
             else:
-                frames.append((parent, moved.matrix(joint.start)))
-        links = [
-            replace(link, parent=parent, offset=_tuples(offset))
-            for link, (parent, offset) in ((link, below(link)) for link in self.links)
-        ]
-        return replace(self, joints=tuple(kept), links=tuple(links))
+                frames[number] = moved.parent, moved.matrix(joint.start)
+        return replace(self, joints=tuple(kept), links=tuple(map(attached, self.links)))
 
 
 def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:

@@ -98,8 +98,7 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
             unit = 1.0 if hinge else size
             low, high = unit * (m.jnt_range[k] - rest) if m.jnt_limited[k] else (-np.inf, np.inf)
             parent, offset = frames[body]
-            anchor = tuple(_rounded(size * m.jnt_pos[k]))
-            axis = tuple(_rounded(m.jnt_axis[k]))
+            axis, anchor = _rounded(m.jnt_axis[k]), _rounded(size * m.jnt_pos[k])
             joints.append(Joint(name, parent, _rounded(offset), hinge, axis, anchor, float(low), float(high)))
             frames[body] = len(joints) - 1, np.eye(4)
     geoms = [
