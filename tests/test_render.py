@@ -111,15 +111,15 @@ def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(
 @pytest.mark.parametrize("view", [*VIEWS.values(), View(-130.0, 5.0)])
 def test_a_fitted_camera_sees_all_points_and_little_else(view):
     points = np.random.default_rng(0).random((50, 3)) * [1.0, 0.5, 0.3]
-    pixels = fit_camera(points, view, SIZE[0] / SIZE[1]).project(points, SIZE)
+    pixels = dataclasses.replace(fit_camera(points, view, SIZE[0] / SIZE[1]), size=SIZE).project(points)
     assert np.all((pixels >= 0) & (pixels <= SIZE))
     spread = np.ptp(pixels, axis=0) / SIZE
     assert 0.8 < spread.max() <= 1
 
 
 def test_the_camera_of_a_scene_sees_manipulators_and_target():
-    camera = scene_camera(scene(SPHERE), box_mass(GHOST), SIZE)
-    seen = camera.project(np.array([SPHERE.position, GHOST, CUBE.center]), SIZE)
+    camera = dataclasses.replace(scene_camera(scene(SPHERE), box_mass(GHOST), SIZE), size=SIZE)
+    seen = camera.project(np.array([SPHERE.position, GHOST, CUBE.center]))
     assert np.all((seen > 0) & (seen < SIZE))
     assert set(suite_tasks()) == set(VIEWS)
     unknown = dataclasses.replace(scene(SPHERE), name="Own")
@@ -147,13 +147,13 @@ def pictures() -> Iterator[dict[str, np.ndarray]]:
         taken["no target"] = without.frame(x, poses)
     with closing(Renderer(world, box_mass(np.array(CUBE.center)), SIZE, camera)) as reached:
         taken["reached"] = reached.frame(x, poses)
-    taken["camera"] = camera
+    taken["camera"] = dataclasses.replace(camera, size=SIZE)
     yield taken
 
 
 def color(pictures: dict, name: str, point: Sequence[float]) -> np.ndarray:
     """Mean colour of the 3 x 3 pixels around a point of the scene."""
-    column, row = np.floor(pictures["camera"].project(np.asarray(point), SIZE)).astype(int)
+    column, row = np.floor(pictures["camera"].project(np.asarray(point))).astype(int)
     return pictures[name][row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).mean(axis=0)
 
 

@@ -64,29 +64,25 @@ class Camera:
     @property
     def focal_length(self) -> float:
         """Focal length [pixels]."""
-        return self._focal_length(self.size[1])
-
-    def _focal_length(self, height: int) -> float:
-        return height / 2 / math.tan(math.radians(self.field_of_view) / 2)
+        return self.size[1] / 2 / math.tan(math.radians(self.field_of_view) / 2)
 
     def intrinsics(self) -> np.ndarray:
         """Return the matrix from camera coordinates (x right, y down, z forward) to pixels, shape [3, 3]."""
         width, height = self.size
         return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
 
-    def project(self, points: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+    def project(self, points: np.ndarray) -> np.ndarray:
         """Project points of the scene onto the image.
 
         Args:
             points: Positions [domain units], shape [..., 3].
-            size: Width and height of the picture [pixels]; the camera's own if None.
 
         Returns:
             Column and row [pixels] from the upper left corner, shape [..., 2].
         """
-        width, height = size or self.size
+        width, height = self.size
         right, up, back = np.moveaxis((points - np.array(self.position)) @ self.axes().T, -1, 0)
-        scale = self._focal_length(height)
+        scale = self.focal_length
         return np.stack([width / 2 - scale * right / back, height / 2 + scale * up / back], axis=-1)
 
     def points(self, depth: np.ndarray) -> np.ndarray:
