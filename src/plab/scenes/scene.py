@@ -228,8 +228,6 @@ def make_body(
 
 # ------------------------------------------------------------------------------------------- manipulators
 
-Quaternion = tuple[float, float, float, float]
-
 ROLL_RADIUS = 0.03
 """Distance travelled by a rolling pin per radian of roll, independent of its radius, as in the PlasticineLab
 release."""
@@ -339,7 +337,7 @@ class Manipulator:
     shape: str
     size: tuple[float, ...]
     position: Vec3
-    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     scale: tuple[float, ...] = ()
     friction: float = 0.9
     lower_bound: Vec3 = (0.0, 0.0, 0.0)
@@ -463,9 +461,7 @@ class Scene:
     @property
     def laws(self) -> tuple[str, ...]:
         """Names of the laws of the materials: one, or one per body if any body has its own material."""
-        return tuple(material.law for material in self.materials[: self.material_count]) or (
-            self.material.law,
-        )
+        return tuple(material.law for material in self.materials[: self.material_count])
 
     @property
     def particle_bodies(self) -> np.ndarray:
@@ -504,7 +500,7 @@ class Scene:
     @property
     def _stiffest(self) -> Material:
         """Material of the body that limits the time step."""
-        return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
+        return min(self.materials, key=lambda m: m.largest_step(self.dx))
 
     def facts(self) -> dict[str, Any]:
         """Return the scene as plain data, without meshes and inherited values of bodies."""
@@ -519,6 +515,7 @@ class Scene:
 
     def validate(self) -> None:
         """Raise SceneError for an invalid scene; the message names the field and a valid value."""
+        _require(len(self.bodies) > 0, "a scene needs at least one body")
         _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
         self.material.validate()
         for number, material in enumerate(self.materials):
@@ -540,7 +537,6 @@ class Scene:
         limit = self.dx / self.dt**2
         advice = f"accelerates by more than a cell per substep: use at most {limit:.3g}"
         _require(math.hypot(*self.gravity) <= limit, f"gravity {self.gravity} {advice}")
-        _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
             self._validate_body(f"bodies[{number}]", body)
         count = len(self.manipulators)
