@@ -234,10 +234,14 @@ class MassTarget(TensorRecipe):
 
     def mass(self, scene: Scene) -> np.ndarray:
         with located("target", TargetError):
-            mass = _read_tensor(*pinned(self.file, self.sha256))
+            mass = _numbers(pinned(self.file, self.sha256)[0], "a mass tensor: use .npy")
         n = scene.grid_size
         if mass.shape != (n, n, n):
             raise TargetError(f"target: {self.file} has shape {list(mass.shape)}, but the grid has {[n] * 3}")
+        below = -mass.clip(max=0.0).sum()
+        if not np.isfinite(mass).all() or not below <= _NEGATIVE * mass.sum() or not mass.any():
+            raise TargetError(f"target: masses in {self.file} must be finite, not negative and not all 0")
+        mass = mass.clip(0.0)
         return mass * (scene.particle_count * scene.particle_mass / mass.sum())
 
 
@@ -261,16 +265,6 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
         shape = list(points.shape)
         raise ShapeError(f"{file} holds an array of shape {shape}, not finite points [point, 3]")
     return points
-
-
-@lru_cache(maxsize=8)
-def _read_tensor(file: str, _sha256: str) -> np.ndarray:
-    """Read a mass tensor, float64, cached by content."""
-    mass = _numbers(file, "a mass tensor: use .npy")
-    below = -mass.clip(max=0.0).sum()
-    if not np.isfinite(mass).all() or not below <= _NEGATIVE * mass.sum() or not mass.any():
-        raise ShapeError(f"{file} must hold masses that are finite, not negative and not all 0")
-    return mass.clip(0.0)
 
 
 def _numbers(file: str, expected: str) -> np.ndarray:
