@@ -123,12 +123,10 @@ def build_targets(
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
         simulator.set_contact("hard")
-        changed = scenes != list(own)
-        if changed:
-            simulator.set_scenes(scenes)
+        simulator.set_scenes(scenes)
         simulator.rollout(np.stack([missing.get(kind, still) for kind in kinds]), gradient=False)
         made = simulator.mass_tensor()
-        simulator.set_scenes(own) if changed else simulator.reset()
+        simulator.set_scenes(own)
         for kind, script in missing.items():
             masses[kind] = mass = made[kinds.index(kind)]
             store.save(kind[0], script, mass)
