@@ -9,7 +9,7 @@ import numpy as np
 
 from plab.errors import ArgumentError
 from plab.losses.term import Term
-from plab.scenes import MANIPULATOR_SHAPES, Scene
+from plab.scenes import Scene
 from plab.sim import Simulator, State
 
 __all__ = ["check_gradient"]
@@ -60,6 +60,9 @@ def gradient_errors(
     scene = simulator.scenes[0]
     shape = (simulator.batch, *[simulator.grid_size] * 3)
     simulator.set_target(scene.particle_mass * rng.random(shape), rng.random(shape))
+    # Mask of the components of poses that can change, shape [manipulator, 8].
+    kinds = [manipulator.kind for manipulator in scene.manipulators]
+    free = np.array([[kind.moves] * 3 + [kind.turns] * 4 + [kind.grips] for kind in kinds], float)
     start = _disturbed(simulator, rng)
     simulator.set_state(start)
     gradient = simulator.loss_gradient()
@@ -74,7 +77,7 @@ def gradient_errors(
         for _ in range(directions):
             way = rng.normal(size=getattr(start, part).shape)
             if part == "poses":
-                way *= _free(scene)
+                way *= free
             ends = [loss(part, sign * STEP * way) for sign in (1, -1)]
             pair = (ends[0] - ends[1]) / (2 * STEP), float((getattr(gradient, part) * way).sum())
             slopes.setdefault(part, []).append(pair)
@@ -87,12 +90,6 @@ def gradient_errors(
         scale = max(1e-6 * largest, *(abs(slope) for pair in pairs for slope in pair))
         errors[part] = max(abs(a - b) for a, b in pairs) / scale
     return errors
-
-
-def _free(scene: Scene) -> np.ndarray:
-    """Mask of the manipulators' pose components that can change, 1 or 0, shape [manipulator, 8]."""
-    kinds = [MANIPULATOR_SHAPES[m.shape] for m in scene.manipulators]
-    return np.array([[kind.moves] * 3 + [kind.turns] * 4 + [kind.grips] for kind in kinds], float)
 
 
 def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:
