@@ -276,7 +276,6 @@ class EpisodeBatch:
             simulator.set_scenes(scenes)
             problem = Problem(cfgs, simulator)
         self._take(cfgs, problem)
-        self._sensors.refresh()
         self._begin()
 
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
@@ -290,11 +289,9 @@ class EpisodeBatch:
         return [unique[id(cfg)] for cfg in cfgs]
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
         self.randomizer = EpisodeRandomizer(cfgs, problem)
-        self._observer = Observer(problem, cfgs[0])
         self._stages = Stages(cfgs, problem) if self._goes_by_stages and any(map(staged, cfgs)) else None
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
@@ -304,7 +301,6 @@ class EpisodeBatch:
         if self._stages:
             self._stages.begin(range(self.size), self.problem)
             self.problem.refresh()
-            self._refresh_views()
         # No step is left before the first reset.
         self._steps = np.full(self.size, self.horizon)
         self._over = np.zeros(self.size, bool)
@@ -319,11 +315,11 @@ class EpisodeBatch:
 
     def _observe_starts(self) -> None:
         """Measure and observe the current states of all environments as initial states."""
+        self._refresh_views()
         self._changes = self._simulator.changes
         self.failures: dict[int, str] = {}
         # Observations and measures of the last step, kept for diverged environments.
-        measured = self._measured()
-        self._last: tuple[Array, ...] = (self._observe(), *measured)
+        self._last: tuple[Array, ...] = (self._observe(), *self._measured())
         self._initial_loss = Constants(self.problem.loss_of(self._last[1]))
 
     @property
@@ -360,20 +356,16 @@ class EpisodeBatch:
             self.randomizer.follow(self.problem)
             if self._stages:
                 self._stages.follow(self.problem)
-            self._begin_again()
-            if state:
-                self._resume(state)
+            self._begin_again(state)
 
-    def _begin_again(self) -> None:
+    def _begin_again(self, state: EpisodeState | None) -> None:
+        """Start with the current scenes and targets of the simulator; continue from a state, if any."""
         self.problem.refresh()
-        self._refresh_views()
         self._observe_starts()
-
-    def _resume(self, state: EpisodeState) -> None:
-        """Continue from a state, with the current targets."""
-        self._simulator.set_state(state.simulation)
-        self._put(state)
-        self._update(self._observe(), self._measured(), kept=list(self.failures))
+        if state is not None:
+            self._simulator.set_state(state.simulation)
+            self._put(state)
+            self._update(self._observe(), self._measured(), kept=list(self.failures))
 
     def _put(self, state: EpisodeState) -> None:
         for name, value in copy.deepcopy(dict(state.episodes)).items():
@@ -548,8 +540,7 @@ class EpisodeBatch:
         if self._stages:
             self._stages.restore(state.stages, self.problem)
         if state.changed_by_hand != self.changed_by_hand:
-            self._begin_again()
-            self._resume(state)
+            self._begin_again(state)
             return self._shown()
         if changed or self._stages:
             self._changes = self._simulator.changes

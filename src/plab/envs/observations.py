@@ -40,9 +40,7 @@ class Observer:
         constant: Number of trailing entries of an observation that are constant within an episode.
     """
 
-    def __init__(
-        self, problem: Problem, cfg: Config, known: Callable[[], Mapping[int, np.ndarray]] = dict
-    ) -> None:
+    def __init__(self, problem: Problem, cfg: Config, known: Callable[[], Mapping[int, np.ndarray]]) -> None:
         """Select the entries for a configuration, and compute the constant ones, except those that ``known``
         returns by environment."""
         scene = problem.scenes[0]
