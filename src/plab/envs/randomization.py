@@ -37,6 +37,9 @@ from plab.sim import Simulator
 from plab.targets import RECIPES, build_target
 from plab.targets.recipes import TensorRecipe
 
+_OF_TARGET = ("target.", "manipulators.")
+"""Prefixes of the keys that a target may depend on."""
+
 Target = tuple[np.ndarray, np.ndarray | None]
 """Mass tensor of a target, and the distance to it, or None to compute it when it is needed."""
 
@@ -93,7 +96,7 @@ class EpisodeRandomizer:
         # With the changes that the caller has made in the simulator.
         self._scenes = list(problem.scenes)
         self._placed: list[Any] = [(base, {}, _places(base.scene)) for base in self._bases]
-        self._targets: list[Any] = [None for _ in cfgs]
+        self._targets: list[tuple[_Base, Values]] = [(base, {}) for base in self._bases]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
         for cfg in unique.values():
             with located("task.randomize"):
@@ -130,13 +133,9 @@ class EpisodeRandomizer:
         computed once per scene."""
         known = {}
         for e, values in enumerate(self.values):
-            base, turns, places = self._placed[e]
-            if (
-                SCENE in values
-                and self._targets[e] == (base, {})
-                and (turns, places) == ({}, _places(base.scene))
-            ):
-                known[e] = base.target_observation
+            moved = any(key.startswith(_OF_TARGET) or key.endswith((".offset", ".yaw")) for key in values)
+            if SCENE in values and not moved:
+                known[e] = self._placed[e][0].target_observation
         return known
 
     def put(self, values: Mapping[int, Values], problem: Problem) -> bool:
@@ -154,9 +153,9 @@ class EpisodeRandomizer:
             place = base, yaws(cfg.task, own), _places(scenes[e])
             if place != self._placed[e]:
                 particles[e] = _moved(*place)
-            follows = [key for key in own if key.startswith(("target.", "manipulators."))]
+            follows = [key for key in own if key.startswith(_OF_TARGET)]
             target = base, {key: own[key] for key in follows}
-            if target != (self._targets[e] or (self._bases[e], {})):
+            if target != self._targets[e]:
                 targets[e] = self._target(base, cfg, scenes[e]) if follows else base.target
             self._placed[e], self._targets[e], self.values[e] = place, target, dict(own)
         problem.set_episode_starts(scenes, particles, targets)
