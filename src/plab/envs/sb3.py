@@ -114,9 +114,8 @@ class PlabVecEnv(VecEnv):
         if over.any():
             rows = np.flatnonzero(over)
             observation, first = self.batch.reset(environments=None if over.all() else rows)
-            starts = self._split(first, {})
             for number in rows:
-                self.reset_infos[number] = starts[number]
+                self.reset_infos[number] = info_of(first, number, {})
         return observation, done.reward.astype(np.float32), over, infos
 
     def get_images(self) -> Sequence[np.ndarray]:
