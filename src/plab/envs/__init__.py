@@ -13,7 +13,7 @@ import gymnasium
 
 from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS, suite_tasks
 
-__all__ = ["ENTRY_POINT", "make", "make_vec", "register_suite", "register_task"]
+__all__ = ["ENTRY_POINT", "make", "make_vec", "register_task"]
 
 ENTRY_POINT = "plab.envs.single:PlabEnv"
 """Entry point of the environments in Gymnasium's registry."""
@@ -38,12 +38,6 @@ def make_vec(
     return gymnasium.make_vec(f"plab/{task}-v{variant}", num_envs=num_envs, **kwargs)
 
 
-def register_suite() -> None:
-    """Register all tasks of the suite and its extension with Gymnasium."""
-    for task in (*suite_tasks(), *EXTENSION_TASKS):
-        register_task(task)
-
-
 def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs: Any) -> None:
     """Register ``plab/<task>-v<variant>`` with Gymnasium.
 
@@ -66,4 +60,5 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
         spec.name, spec.version = f"{task}-v{variant}", None
 
 
-register_suite()
+for _task in (*suite_tasks(), *EXTENSION_TASKS):
+    register_task(_task)
