@@ -228,8 +228,7 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
         if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
             raise ValueError(f"has the mass of {total:.0f} particles, not {' or '.join(map(str, expected))}")
     except FileNotFoundError:
-        reason = "does not exist; name the files like Move3D-v1.npy"
-        raise TargetError(f"targets.source: {path} {reason}") from None
+        raise TargetError(f"targets.source: {path} does not exist; name files like Move3D-v1.npy") from None
     except (ValueError, OSError) as error:
         raise TargetError(f"targets.source: {path} {getattr(error, 'strerror', None) or error}") from None
     return mass.astype(np.float64)

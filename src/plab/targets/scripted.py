@@ -96,8 +96,7 @@ class Script(Recipe):
     def material(self) -> dict[str, float]:
         """Material parameters that differ from the scene's, by the names of
         :data:`plab.scenes.MATERIAL_KEYS`."""
-        values = {key: getattr(self, key) for key in MATERIAL_KEYS}
-        return {key: value for key, value in values.items() if value is not None}
+        return {key: value for key in MATERIAL_KEYS if (value := getattr(self, key)) is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
         """Sample the demonstration's actions in [-1, 1], shape [EPISODE_STEPS, A]; raise TargetError if a
