@@ -21,7 +21,7 @@ from plab.targets import (
     load_release_target,
     make_recipe,
 )
-from plab.targets.build import TargetStore
+from plab.targets.build import load_mass, save_mass, target_path
 from toy_runner import COARSE_32
 
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}
@@ -127,36 +127,31 @@ class Recorder:
     precision, device = "float32", "cpu"
 
 
-@pytest.fixture
-def store(tmp_path, monkeypatch) -> TargetStore:
+def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypatch):
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
-    return TargetStore(Recorder())
-
-
-def test_cached_mass_comes_back_and_other_scenes_do_not(rope, store, monkeypatch):
     actions = np.zeros((50, 6))
+    path = target_path(Recorder, rope, actions)
     mass = np.zeros((64, 64, 64))
     mass[3, 4, 5], mass[63, 63, 63] = 1.25e-4, np.float32(0.1)
-    assert store.load(rope, actions) is None
-    store.save(rope, actions, mass)
-    assert np.array_equal(store.load(rope, actions), mass)
+    assert load_mass(path, 64) is None
+    save_mass(path, mass)
+    assert np.array_equal(load_mass(path, 64), mass)
     # The length of later episodes does not matter, all else does.
-    assert store.load(replace(rope, horizon=3), actions) is not None
-    assert store.load(replace(rope, yield_stress=51.0), actions) is None
-    assert store.load(replace(rope, particle_seed=1), actions) is None
-    assert store.load(rope, actions + 1e-4) is None
+    assert target_path(Recorder, replace(rope, horizon=3), actions) == path
+    assert target_path(Recorder, replace(rope, yield_stress=51.0), actions) != path
+    assert target_path(Recorder, replace(rope, particle_seed=1), actions) != path
+    assert target_path(Recorder, rope, actions + 1e-4) != path
     with monkeypatch.context() as patch:
         patch.setattr(Recorder, "precision", "float64")
-        assert TargetStore(Recorder()).load(rope, actions) is None
+        assert target_path(Recorder, rope, actions) != path
     # Damaged, or unwritable.
-    path = store.path(rope, actions)
     for content in (path.read_bytes()[:100], b""):
         path.write_bytes(content)
-        assert store.load(rope, actions) is None
+        assert load_mass(path, 64) is None
     monkeypatch.setenv("PLAB_CACHE_DIR", str(path))
-    blocked = TargetStore(Recorder())
-    blocked.save(rope, actions, mass)
-    assert blocked.load(rope, actions) is None
+    blocked = target_path(Recorder, rope, actions)
+    save_mass(blocked, mass)
+    assert load_mass(blocked, 64) is None
 
 
 def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, monkeypatch, device):

@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 
 from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, one_protocol, require_possible
-from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, group_names, shipped_file, suite_tasks
+from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, choices, shipped_file, suite_tasks
 from plab.errors import ArgumentError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
@@ -252,7 +252,7 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     from plab.results import config_dict
 
     chosen = {"method": method, "protocol": protocol}
-    chosen = {group: name for group, name in chosen.items() if name in group_names(group)}
+    chosen = {group: name for group, name in chosen.items() if name in choices(group)}
     # Learning rate and contact weight may depend on the name of the task. Composing its file is slow.
     words = [f"task.name={quoted(task)}", *(f"{group}={name}" for group, name in chosen.items())]
     config = config_dict(load_config(words))

@@ -107,19 +107,21 @@ def build_targets(
         TargetError: See :func:`build_target`.
         plab.sim.SimulationError: If the simulation of a demonstration diverges.
     """
-    store, own = TargetStore(simulator), simulator.scenes
+    own = simulator.scenes
     scenes = [_target_scene(scene, make_recipe(target)) for scene, target in zip(own, targets, strict=True)]
     # Vectorised environments are often equal, so each kind is built once.
     kinds = [(scene, id(target)) for scene, target in zip(scenes, targets, strict=True)]
-    masses: dict[tuple[Scene, int], np.ndarray | None] = {}
+    masses: dict[tuple[Scene, int], np.ndarray] = {}
     missing: dict[tuple[Scene, int], np.ndarray] = {}
     for kind, target in dict(zip(kinds, targets, strict=True)).items():
         if (script := demonstration(kind[0], target)) is None:
             masses[kind] = build_target(kind[0], target)
             continue
-        masses[kind] = None if rebuild else store.load(kind[0], script)
-        if masses[kind] is None:
+        known = load_mass(target_path(simulator, kind[0], script), simulator.grid_size)
+        if known is None or rebuild:
             missing[kind] = script
+        else:
+            masses[kind] = known
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
         simulator.set_contact("hard")
@@ -128,9 +130,9 @@ def build_targets(
         made = simulator.mass_tensor()
         simulator.set_scenes(own)
         for kind, script in missing.items():
-            masses[kind] = mass = made[kinds.index(kind)]
-            store.save(kind[0], script, mass)
-    return np.stack([cast(np.ndarray, masses[kind]) for kind in kinds])
+            masses[kind] = made[kinds.index(kind)]
+            save_mass(target_path(simulator, kind[0], script), masses[kind])
+    return np.stack([masses[kind] for kind in kinds])
 
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
@@ -163,42 +165,37 @@ lower face of the domain, and down to -1.5 for the stray particles outside in th
 """
 
 
-class TargetStore:
-    """Cache of simulated targets, keyed by scene, actions, precision, device and physics."""
+def target_path(simulator: Simulator, scene: Scene, actions: np.ndarray) -> Path:
+    """Return the cache file of a simulated target, by scene, actions, shape [T, A], precision, device and
+    physics."""
+    made_by = {"by": (simulator.precision, simulator.device), "physics": PHYSICS_VERSION}
+    # The horizon is ignored; meshes are identified by content.
+    facts = replace(scene, horizon=0).facts() | made_by
+    text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
+    digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
+    return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
 
-    def __init__(self, simulator: Simulator) -> None:
-        """Open the store for a simulator, with its precision and device as part of the key."""
-        self._made_by = (simulator.precision, simulator.device)
 
-    def path(self, scene: Scene, actions: np.ndarray) -> Path:
-        """Return the cache file of the target for a scene and a demonstration, shape [T, A]."""
-        # The horizon is ignored; meshes are identified by content.
-        facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
-        text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
-        digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
-        return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
+def load_mass(path: Path, n: int) -> np.ndarray | None:
+    """Return a target's mass tensor, shape [n, n, n], or None if it is missing or unreadable."""
+    try:
+        kept = read_arrays(path)
+        mass = np.zeros(n**3)
+        mass[kept["node"]] = kept["mass"]
+    except Exception:
+        return None
+    return mass.reshape(n, n, n) if np.isfinite(mass).all() and mass.any() else None
 
-    def load(self, scene: Scene, actions: np.ndarray) -> np.ndarray | None:
-        """Return a target's mass tensor, shape [n, n, n], or None if it is missing or unreadable."""
-        n = scene.grid_size
-        try:
-            kept = read_arrays(self.path(scene, actions))
-            mass = np.zeros(n**3)
-            mass[kept["node"]] = kept["mass"]
-        except Exception:
-            return None
-        return mass.reshape(n, n, n) if np.isfinite(mass).all() and mass.any() else None
 
-    def save(self, scene: Scene, actions: np.ndarray, mass: np.ndarray) -> None:
-        """Store a mass tensor, shape [n, n, n], if the folder is writable."""
-        path = self.path(scene, actions)
-        node = np.flatnonzero(mass)
-        # If the folder is not writable, the target is generated again each time.
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-                np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
-            os.replace(file.name, path)
+def save_mass(path: Path, mass: np.ndarray) -> None:
+    """Store a mass tensor, shape [n, n, n], if the folder is writable."""
+    node = np.flatnonzero(mass)
+    # If the folder is not writable, the target is generated again each time.
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
+        os.replace(file.name, path)
 
 
 def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.ndarray:
