@@ -495,8 +495,9 @@ class EpisodeBatch:
     def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
         """Advance environments that have reached their stage's target; return the rewards."""
         reward = reward + Constants(stages.earned.copy()).like(like)
-        stages.note(_on_host(info["score"]))
-        reached = _on_host(info["score"]) >= self._success_score
+        score = _on_host(info["score"])
+        stages.scores[np.arange(self.size), stages.current] = score
+        reached = score >= self._success_score
         reached[list(self.failures)] = False
         rows = np.flatnonzero(reached & ~stages.last).tolist()
         if rows:

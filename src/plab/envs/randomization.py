@@ -166,8 +166,6 @@ class EpisodeRandomizer:
         replace samples, for all or one per sub-environment; raise ValueError if a key is unknown."""
         cfg = self._cfgs[e]
         pool = self._pools.get(id(cfg), ())
-        if not (cfg.task.randomize or given):
-            return {}
         rng = np.random.default_rng(list(seed))
         values = draw(self._bounds[id(cfg)], rng)
         if pool:
@@ -275,8 +273,7 @@ class Stages:
         self._targets = []
         for number in range(len(cfgs[0].task.stages)):
             # Equal configurations share one object, and so do their targets.
-            targets = {id(cfg): cfg.task.stages[number] for cfg in cfgs}
-            own = {id(c): replace(c, task=replace(c.task, target=targets[id(c)])) for c in cfgs}
+            own = {id(c): replace(c, task=replace(c.task, target=c.task.stages[number])) for c in cfgs}
             masses = make_targets([own[id(cfg)] for cfg in cfgs], problem.simulator)
             self._targets.append([(mass, target_distance(mass)) for mass in masses])
         self._targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
@@ -319,7 +316,3 @@ class Stages:
         """Restore the state of the current episode."""
         current, self.earned, self.scores = (part.copy() for part in saved)
         self.enter(current, problem)
-
-    def note(self, score: np.ndarray) -> None:
-        """Record the scores of the current stages, shape [batch]."""
-        self.scores[np.arange(len(score)), self.current] = score

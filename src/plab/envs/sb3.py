@@ -112,7 +112,7 @@ class PlabVecEnv(VecEnv):
             if over[number]:
                 info["terminal_observation"] = mapped(operator.itemgetter(number), observation)
         if over.any():
-            rows = np.flatnonzero(over)
+            rows = np.flatnonzero(over).tolist()
             observation, first = self.batch.reset(environments=None if over.all() else rows)
             for number in rows:
                 self.reset_infos[number] = info_of(first, number, {})

@@ -113,7 +113,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         over = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and over.any():
             ended: dict[str, Any] = {}
-            for e in np.flatnonzero(over):
+            for e in np.flatnonzero(over).tolist():
                 final = {"final_obs": mapped(operator.itemgetter(e), observation)}
                 final["final_info"] = info_of(done.info, e, done.failures)
                 ended = self._add_info(ended, final, e)
