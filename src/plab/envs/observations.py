@@ -178,7 +178,6 @@ class Sensors:
         looking = self._pictures or "points" in self.names
         self._cameras = {name: CameraSensor(simulator, one) for name, one in self.cameras.items() if looking}
         sensors = list(self._cameras.values())
-        of_points = _OfTargets(simulator, lambda mass: _sampled(mass, points))
         force = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
 
         def positions(like: Array) -> Array:
@@ -190,7 +189,7 @@ class Sensors:
             "mass": (_unit(CELLS, CELLS, CELLS), lambda like: _shares(positions(like))),
             "impulses": (force, simulator.impulses),
             "target_mass": (_unit(CELLS, CELLS, CELLS), _OfTargets(simulator, coarse_shares)),
-            "target_points": (_unit(points, 3), of_points),
+            "target_points": (_unit(points, 3), _OfTargets(simulator, lambda mass: _sampled(mass, points))),
             "points": (_unit(points, 4 if sensors else 3), SurfacePoints(simulator, points, sensors)),
         }
         spaces = {name: space for name, (space, _) in sources.items() if name in self.names}
