@@ -11,6 +11,7 @@ import threading
 from argparse import Namespace
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -127,6 +128,14 @@ def test_unreadable_files_are_named_each_time(folder: Path) -> None:
             assert ask(folder, "SELECT count(*) FROM runs") == [(3,)]
     with pytest.raises(ResultsError, match="nowhere"):
         connect([folder, folder / "nowhere"])
+
+
+def test_runs_without_iterations_are_queried(folder: Path) -> None:
+    for kept in (folder, folder.parent / "alone"):
+        synthetic.save(replace(synthetic.run(kept, seed=9), columns={}, status="running"))
+    for source, counts in ((folder, (4, 3)), (folder.parent / "alone", (1, 0))):
+        assert ask(source, "SELECT count(*) FROM runs") == [counts[:1]]
+        assert ask(source, "SELECT count(DISTINCT run) FROM iterations") == [counts[1:]]
 
 
 def test_a_run_with_damaged_iterations_is_named_and_left_out_everywhere(folder: Path) -> None:

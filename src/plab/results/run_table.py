@@ -458,8 +458,8 @@ def _connected(
     }
     if iterations:
         curves = read_curves(row.path for row in found)
-        frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
-        tables["iterations"] = pd.concat(frames or [table[["run"]]])
+        frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves) if columns]
+        tables["iterations"] = pd.concat(frames or [table[["run"]][:0]])
     connection = duckdb.connect()
     for name, frame in tables.items():
         connection.register("frame", frame)
