@@ -111,8 +111,8 @@ def instructions_of_the_host() -> Iterator[None]:
 
     own = bitcode._cache() / "host"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Scalars, "product", Code.mul)
-        patch.setattr(Scalars, "div", Code.div)
+        patch.setattr(Scalars, "product", Code.multiply)
+        patch.setattr(Scalars, "divide", Code.divide)
         patch.setattr(bitcode, "_cache", lambda: own)
         bitcode.bitcode_file.cache_clear()
         yield

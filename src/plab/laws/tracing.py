@@ -8,12 +8,12 @@ instructions. Equal nodes are recorded once, and unused nodes are not computed.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 __all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen", "require_supported"]
 
@@ -33,13 +33,20 @@ class Primitive:
     function: Callable[[Any], Any]
     derivative: Callable[[Any, Any], Any]
 
+    def __call__(self, number: Any) -> Any:
+        return self.function(number)
 
-class Node:
-    """A recorded number: an input, or an operation on nodes and constants."""
 
-    def __init__(
-        self, trace: Trace, place: int, operation: str | Primitive, arguments: tuple[Number, ...]
-    ) -> None:
+class Node(NDArrayOperatorsMixin):
+    """A recorded number: an input, or an operation on nodes and constants.
+
+    NumPy calls :meth:`__array_ufunc__` for its functions and for Python's operators.
+    """
+
+    # Nodes are keys, equal only to themselves.
+    __eq__, __hash__ = object.__eq__, object.__hash__
+
+    def __init__(self, trace: Trace, place: int, operation: Any, arguments: tuple[Number, ...]) -> None:
         self.trace, self.place, self.operation, self.arguments = trace, place, operation, arguments
 
     @property
@@ -47,76 +54,53 @@ class Node:
         """Whether values have single precision."""
         return self.trace.single
 
-    def __add__(self, other: Number) -> Number:
-        return self.trace.sum(self, other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: Number) -> Number:
-        return self.trace.difference(self, other)
-
-    def __rsub__(self, other: Number) -> Number:
-        return self.trace.difference(other, self)
-
-    def __mul__(self, other: Number) -> Number:
-        return self.trace.product(self, other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: Number) -> Number:
-        return self.trace.node("div", self, other)
-
-    def __rtruediv__(self, other: Number) -> Number:
-        return self.trace.node("div", other, self)
-
-    def __neg__(self) -> Number:
-        return self.arguments[0] if self.operation == "neg" else self.trace.node("neg", self)
-
-    def __lt__(self, other: Number) -> Node:
-        return self.trace.node("less", self, other)
-
-    def __gt__(self, other: Number) -> Node:
-        return self.trace.node("less", other, self)
-
     def __bool__(self) -> bool:
         raise TypeError("`if` on a component: use np.where, and np.minimum and np.maximum to clamp")
 
-    def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
-        """Record a NumPy function, or an operator whose left operand is a NumPy number."""
-        if function in OPERATORS:
-            left, right = given
-            return OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
-        require_supported(function, _FUNCTIONS)
-        return self.trace.node(_FUNCTIONS[function], *given)
+    def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number, out: Any = None) -> Number:
+        """Record a NumPy function or an operator; ``out`` of augmented assignments is not needed."""
+        require_supported(function)
+        trace, given = self.trace, tuple(float(x) if isinstance(x, np.generic) else x for x in given)
+        match function:
+            case np.add:
+                return trace.sum(*given)
+            case np.subtract:
+                return trace.difference(*given)
+            case np.multiply:
+                return trace.product(*given)
+            case np.negative:
+                return self.arguments[0] if _negated(self) else trace.node(np.negative, self)
+            case np.greater:
+                return trace.node(np.less, *reversed(given))
+        return trace.node(function, *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _keywords: Any) -> Number:
         """Record :func:`numpy.where`."""
-        require_supported(function, {np.where: "where"})
-        return self.trace.node("where", *given)
+        require_supported(function)
+        return self.trace.node(function, *given)
 
 
-_FUNCTIONS = {getattr(np, name): name for name in ("sqrt", "minimum", "maximum", "exp", "log")}
+SUPPORTED = (
+    *(np.add, np.subtract, np.multiply, np.divide, np.negative, np.less, np.greater),
+    *(np.sqrt, np.minimum, np.maximum, np.exp, np.log, np.where),
+)
+"""NumPy's functions of components, the first seven as operators."""
 
 
-def require_supported(function: Any, supported: Mapping[Any, str]) -> None:
+def require_supported(function: Any) -> None:
     """Raise TypeError if a NumPy function of a component is not supported."""
-    if function not in supported:
-        names = ", ".join((*_FUNCTIONS.values(), "where"))
+    if function not in SUPPORTED:
+        names = ", ".join(one.__name__ for one in SUPPORTED[7:])
         raise TypeError(f"np.{function.__name__} of a component: use + - * /, < and >, and NumPy's {names}")
-
-
-OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
-    np.add: operator.add,
-    np.subtract: operator.sub,
-    np.multiply: operator.mul,
-    np.divide: operator.truediv,
-}
-"""Operators that NumPy numbers call as functions."""
 
 
 def frozen(number: Number) -> Number:
     """Return a number that derivatives treat as constant."""
-    return number.trace.node("frozen", number) if isinstance(number, Node) else number
+    return number.trace.node(_unchanged, number) if isinstance(number, Node) else number
+
+
+def _unchanged(number: Number) -> Number:
+    return number
 
 
 class Trace:
@@ -129,9 +113,9 @@ class Trace:
 
     def inputs(self, name: str, count: int) -> list[Node]:
         """Return new inputs; ``name`` distinguishes them from other inputs."""
-        return [self.node("input", f"{name}{k}") for k in range(count)]
+        return [self.node(None, f"{name}{k}") for k in range(count)]
 
-    def node(self, operation: str | Primitive, *arguments: Number) -> Node:
+    def node(self, operation: Any, *arguments: Number) -> Node:
         """Record an operation, or return the existing node."""
         key = (operation, *((one.place,) if isinstance(one, Node) else one for one in arguments))
         if key not in self._known:
@@ -145,13 +129,13 @@ class Trace:
             return b if _equals(a, 0.0) else a
         if _negated(b):
             return self.difference(a, b.arguments[0])
-        return self.difference(b, a.arguments[0]) if _negated(a) else self.node("add", a, b)
+        return self.difference(b, a.arguments[0]) if _negated(a) else self.node(np.add, a, b)
 
     def difference(self, a: Number, b: Number) -> Number:
         """Record a - b."""
         if _equals(a, 0.0) or _equals(b, 0.0):
             return -b if _equals(a, 0.0) else a
-        return self.sum(a, b.arguments[0]) if _negated(b) else self.node("sub", a, b)
+        return self.sum(a, b.arguments[0]) if _negated(b) else self.node(np.subtract, a, b)
 
     def product(self, a: Number, b: Number) -> Number:
         """Record a b."""
@@ -160,13 +144,13 @@ class Trace:
         if not isinstance(a, Node):
             if a in (0.0, 1.0):
                 return a * 0.0 if a == 0.0 else b
-            if b.operation == "mul" and not isinstance(b.arguments[0], Node):
+            if b.operation is np.multiply and not isinstance(b.arguments[0], Node):
                 return self.product(a * b.arguments[0], b.arguments[1])
-            return self.product(-a, b.arguments[0]) if _negated(b) else self.node("mul", a, b)
+            return self.product(-a, b.arguments[0]) if _negated(b) else self.node(np.multiply, a, b)
         for one, other in ((a, b), (b, a)):
             if _negated(one):
                 return -self.product(one.arguments[0], other)
-        return self.node("mul", *sorted((a, b), key=lambda one: one.place))
+        return self.node(np.multiply, *sorted((a, b), key=lambda one: one.place))
 
 
 def _equals(one: Number, constant: float) -> bool:
@@ -174,41 +158,41 @@ def _equals(one: Number, constant: float) -> bool:
 
 
 def _negated(one: Number) -> bool:
-    return isinstance(one, Node) and one.operation == "neg"
+    return isinstance(one, Node) and one.operation is np.negative
 
 
 def _shares(node: Node, bar: Number) -> Sequence[Number]:
     """Return the contributions of a node's adjoint to the adjoints of its arguments."""
     a, *rest = node.arguments
-    where = node.trace.node
+    record = node.trace.node
     if isinstance(node.operation, Primitive):
         return (bar * node.operation.derivative(node, a),)
     match node.operation:
-        case "add":
+        case np.add:
             return bar, bar
-        case "sub":
+        case np.subtract:
             return bar, -bar
-        case "neg":
+        case np.negative:
             return (-bar,)
-        case "mul":
+        case np.multiply:
             return bar * rest[0], bar * a
-        case "div":
+        case np.divide:
             share = bar / rest[0]
             return share, -(share * node)
-        case "sqrt":
+        case np.sqrt:
             return (0.5 * bar / node,)
-        case "minimum":
-            least = where("less", a, rest[0])
-            return where("where", least, bar, 0.0), where("where", least, 0.0, bar)
-        case "maximum":
-            most = where("less", rest[0], a)
-            return where("where", most, bar, 0.0), where("where", most, 0.0, bar)
-        case "exp":
+        case np.minimum:
+            least = record(np.less, a, rest[0])
+            return record(np.where, least, bar, 0.0), record(np.where, least, 0.0, bar)
+        case np.maximum:
+            most = record(np.less, rest[0], a)
+            return record(np.where, most, bar, 0.0), record(np.where, most, 0.0, bar)
+        case np.exp:
             return (bar * node,)
-        case "log":
+        case np.log:
             return (bar / a,)
-        case "where":
-            return 0.0, where("where", a, bar, 0.0), where("where", a, 0.0, bar)
+        case np.where:
+            return 0.0, record(np.where, a, bar, 0.0), record(np.where, a, 0.0, bar)
     raise ValueError(f"no derivative of {node.operation}")
 
 
@@ -223,7 +207,7 @@ def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Seque
     trace = inputs[0].trace
     varied = {one.place for one in inputs}
     for node in trace.nodes[min(varied) :]:
-        if node.operation not in ("frozen", "less") and any(
+        if node.operation not in (_unchanged, np.less) and any(
             isinstance(one, Node) and one.place in varied for one in node.arguments
         ):
             varied.add(node.place)
@@ -241,19 +225,6 @@ def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Seque
             for argument, bar in zip(node.arguments, _shares(node, sums[node.place]), strict=True):
                 share(argument, bar)
     return [sums.get(one.place, 0.0) for one in inputs]
-
-
-OPERATIONS: dict[str, Callable[..., Any]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "neg": operator.neg,
-    "less": operator.lt,
-    "frozen": lambda number: number,
-    "where": np.where,
-    **{name: function for function, name in _FUNCTIONS.items()},
-}
 
 
 def evaluated(outputs: Sequence[Number], given: Mapping[Node, Any]) -> list[Any]:
@@ -279,7 +250,5 @@ def evaluated(outputs: Sequence[Number], given: Mapping[Node, Any]) -> list[Any]
 
     for place in sorted(needed):
         node = next(iter(given)).trace.nodes[place]
-        own = node.operation
-        function = own.function if isinstance(own, Primitive) else OPERATIONS[own]
-        values[place] = function(*map(value, node.arguments))
+        values[place] = node.operation(*map(value, node.arguments))
     return [value(one) for one in outputs]

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from plab.laws.tracing import OPERATORS, require_supported
+from plab.laws.tracing import require_supported
 from plab.sim.storage import LANES
 
 LANE = LANES["cpu"]
@@ -59,32 +60,34 @@ class Code:
     def add(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fadd(a, b, flags=("contract",))
 
-    def sub(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def subtract(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fsub(a, b, flags=("contract",))
 
-    def mul(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def multiply(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fmul(a, b, flags=("contract",))
 
-    def div(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def divide(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fdiv(a, b)
 
     def exp(self, a: ir.Value) -> ir.Value:
         """Exponential: a power of two times a Taylor series, accurate to a few units in the last place."""
         bits, bias, limit, terms = (23, 127, 87.0, 8) if self.single else (52, 1023, 708.0, 14)
-        a = self.least(self.most(a, self.constant(-limit)), self.constant(limit))
-        turns = self.mul(a, self.constant(1.0 / math.log(2.0)))
-        half = self.chosen(self.below(a, self.constant(0.0)), self.constant(-0.5), self.constant(0.5))
+        a = self.minimum(self.maximum(a, self.constant(-limit)), self.constant(limit))
+        turns = self.multiply(a, self.constant(1.0 / math.log(2.0)))
+        half = self.where(self.less(a, self.constant(0.0)), self.constant(-0.5), self.constant(0.5))
         whole = self._b.fptosi(self.add(turns, half), self._integers(a, 32))
         n = self._b.sitofp(whole, a.type)
         high, low = self._ln2()
-        r = self.sub(self.sub(a, self.mul(n, self.constant(high))), self.mul(n, self.constant(low)))
+        r = self.subtract(
+            self.subtract(a, self.multiply(n, self.constant(high))), self.multiply(n, self.constant(low))
+        )
         series = self.constant(1.0 / math.factorial(terms - 1))
         for k in reversed(range(terms - 1)):
-            series = self.add(self.mul(series, r), self.constant(1.0 / math.factorial(k)))
+            series = self.add(self.multiply(series, r), self.constant(1.0 / math.factorial(k)))
         wide = self._integers(a, 32 if self.single else 64)
         exponent = whole if self.single else self._b.sext(whole, wide)
         shifted = self._b.shl(self._b.add(exponent, self._whole(wide, bias)), self._whole(wide, bits))
-        return self.mul(series, self._b.bitcast(shifted, a.type))
+        return self.multiply(series, self._b.bitcast(shifted, a.type))
 
     def log(self, a: ir.Value) -> ir.Value:
         """Natural logarithm of positive normal numbers, by the series of atanh; undefined for others."""
@@ -96,18 +99,18 @@ class Code:
         m = self._b.bitcast(self._b.or_(mantissa, self._whole(wide, bias << bits)), a.type)
         small = exponent if self.single else self._b.trunc(exponent, self._integers(a, 32))
         n = self._b.sitofp(small, a.type)
-        above = self.below(self.constant(math.sqrt(2.0)), m)
-        m = self.chosen(above, self.mul(m, self.constant(0.5)), m)
-        n = self.chosen(above, self.add(n, self.constant(1.0)), n)
+        above = self.less(self.constant(math.sqrt(2.0)), m)
+        m = self.where(above, self.multiply(m, self.constant(0.5)), m)
+        n = self.where(above, self.add(n, self.constant(1.0)), n)
         one = self.constant(1.0)
-        s = self.div(self.sub(m, one), self.add(m, one))
-        square = self.mul(s, s)
+        s = self.divide(self.subtract(m, one), self.add(m, one))
+        square = self.multiply(s, s)
         series = self.constant(2.0 / (2 * terms - 1))
         for k in reversed(range(terms - 1)):
-            series = self.add(self.mul(series, square), self.constant(2.0 / (2 * k + 1)))
+            series = self.add(self.multiply(series, square), self.constant(2.0 / (2 * k + 1)))
         high, low = self._ln2()
-        rest = self.add(self.mul(s, series), self.mul(n, self.constant(low)))
-        return self.add(self.mul(n, self.constant(high)), rest)
+        rest = self.add(self.multiply(s, series), self.multiply(n, self.constant(low)))
+        return self.add(self.multiply(n, self.constant(high)), rest)
 
     def _ln2(self) -> tuple[float, float]:
         """ln 2 as a leading term, whose products with small integers are exact, and a remainder."""
@@ -124,21 +127,20 @@ class Code:
             return ir.Constant(kind, [kind.element(number)] * kind.count)
         return kind(number)
 
-    def minus(self, a: ir.Value) -> ir.Value:
+    def negative(self, a: ir.Value) -> ir.Value:
         return self._b.fneg(a)
 
-    def root(self, a: ir.Value) -> ir.Value:
+    def sqrt(self, a: ir.Value) -> ir.Value:
         kind = ir.FunctionType(a.type, [a.type])
         wide = f"v{LANE}" if isinstance(a.type, ir.VectorType) else ""
-        name = f"llvm.sqrt.{wide}{'f32' if isinstance(self.real, ir.FloatType) else 'f64'}"
-        known = self._b.module.globals.get(name)
-        return self._b.call(known or ir.Function(self._b.module, kind, name), [a])
+        name = f"llvm.sqrt.{wide}{'f32' if self.single else 'f64'}"
+        return self._b.call(self._b.module.declare_intrinsic(name, fnty=kind), [a])
 
     def constant(self, number: float) -> ir.Value:
         """A constant in all lanes."""
         return ir.Constant(ir.VectorType(self.real, LANE), [self.real(number)] * LANE)
 
-    def below(self, a: ir.Value, b: ir.Value, *, equal: bool = False) -> ir.Value:
+    def less(self, a: ir.Value, b: ir.Value, *, equal: bool = False) -> ir.Value:
         """Mask of the lanes in which a < b, or a <= b if ``equal``; False for NaN."""
         return self._b.fcmp_ordered("<=" if equal else "<", a, b)
 
@@ -149,7 +151,7 @@ class Code:
         """Mask of the lanes in which ``other`` holds or ``condition`` does not."""
         return self._b.or_(self._b.not_(condition), other)
 
-    def chosen(self, where: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
+    def where(self, where: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.select(where, a, b)
 
     def all_of(self, *conditions: ir.Value) -> ir.Value:
@@ -158,13 +160,13 @@ class Code:
         return self._b.uitofp(self._b.icmp_unsigned("==", bits, ir.IntType(LANE)(2**LANE - 1)), self.real)
 
     def dot(self, a: Sequence[ir.Value], b: Sequence[ir.Value]) -> ir.Value:
-        return reduce(self.add, map(self.mul, a, b))
+        return reduce(self.add, map(self.multiply, a, b))
 
-    def least(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def minimum(self, a: ir.Value, b: ir.Value) -> ir.Value:
         """The smaller number, ``b`` if either is NaN."""
         return self._b.select(self._b.fcmp_ordered("<", a, b), a, b)
 
-    def most(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def maximum(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.select(self._b.fcmp_ordered(">", a, b), a, b)
 
     def inside(self, y: ir.Value, end: ir.Value, value: ir.Value) -> ir.Value:
@@ -175,13 +177,10 @@ class Code:
 
     # -- memory -------------------------------------------------------------------------------------
 
-    def at(self, pointer: ir.Value, entry: int) -> ir.Value:
-        return self._b.gep(pointer, [WORD(entry)])
+    def at(self, pointer: ir.Value, entry: int | ir.Value) -> ir.Value:
+        return self._b.gep(pointer, [WORD(entry) if isinstance(entry, int) else entry])
 
-    def moved(self, pointer: ir.Value, entries: ir.Value) -> ir.Value:
-        return self._b.gep(pointer, [entries])
-
-    def mul_word(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def multiply_word(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.mul(a, b)
 
     def lane(self, pointer: ir.Value, entry: int) -> ir.Value:
@@ -208,7 +207,7 @@ class Code:
 
     @property
     def _align(self) -> int:
-        return 4 if isinstance(self.real, ir.FloatType) else 8
+        return 4 if self.single else 8
 
     # -- vectors ------------------------------------------------------------------------------------
 
@@ -242,7 +241,7 @@ class Code:
 
     def times(self, row: Row, factor: ir.Value, to: Row | None = None) -> Row:
         """Row times a number, added to another row."""
-        product = self.both(self.mul, row, (self.splat(factor, 8), self.splat(factor, 4)))
+        product = self.both(self.multiply, row, (self.splat(factor, 8), self.splat(factor, 4)))
         return product if to is None else self.both(self.add, to, product)
 
     def read(self, pointer: ir.Value) -> Row:
@@ -277,13 +276,13 @@ class Scalars(Code):
                 return self._b.fma(*self._factors[one], other)
         return self._b.fadd(a, b)
 
-    def sub(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def subtract(self, a: ir.Value, b: ir.Value) -> ir.Value:
         if a not in self._factors and b in self._factors:
             left, right = self._factors[b]
-            return self._b.fma(self.minus(left), right, a)
-        return self.add(a, self.minus(b)) if a in self._factors else self._b.fsub(a, b)
+            return self._b.fma(self.negative(left), right, a)
+        return self.add(a, self.negative(b)) if a in self._factors else self._b.fsub(a, b)
 
-    def mul(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def multiply(self, a: ir.Value, b: ir.Value) -> ir.Value:
         out = self.product(a, b)
         self._factors[out] = a, b
         return out
@@ -293,13 +292,12 @@ class Scalars(Code):
         code, register = ("mul.rn.ftz.f32", "f") if self.single else ("mul.rn.f64", "d")
         return self._b.asm(kind, f"{code} $0, $1, $2;", f"={register},{register},{register}", (a, b), False)
 
-    def div(self, a: ir.Value, b: ir.Value) -> ir.Value:
+    def divide(self, a: ir.Value, b: ir.Value) -> ir.Value:
         if not self.single:
             return self._b.fdiv(a, b)
         # The compiler would combine a quotient with a root in the divisor.
         name, kind = "llvm.nvvm.div.approx.ftz.f", ir.FunctionType(self.real, [self.real] * 2)
-        known = self._b.module.globals.get(name)
-        return self._b.call(known or ir.Function(self._b.module, kind, name), (a, b))
+        return self._b.call(self._b.module.declare_intrinsic(name, fnty=kind), (a, b))
 
     def constant(self, number: float) -> ir.Value:
         return self.real(number)
@@ -308,7 +306,7 @@ class Scalars(Code):
         """Return the conjunction of conditions."""
         return reduce(self._b.and_, conditions)
 
-    def where(self, condition: ir.Value) -> AbstractContextManager[Any]:
+    def when(self, condition: ir.Value) -> AbstractContextManager[Any]:
         return self._b.if_then(condition)
 
     def either(self, condition: ir.Value) -> AbstractContextManager[Any]:
@@ -336,70 +334,29 @@ class Scalars(Code):
         return [Number(self, self.number(row, k)) for k in range(4)]
 
 
-class Number:
-    """A vector of lanes or one number; each operator emits an instruction."""
+class Number(NDArrayOperatorsMixin):
+    """A vector of lanes or one number; each operator and each of NumPy's functions emits an instruction."""
 
     def __init__(self, code: Code, value: ir.Value) -> None:
         self.code, self.value, self.single = code, value, code.single
 
-    def _operation(self, name: str, *given: Number | float) -> Number:
-        values = [one.value if isinstance(one, Number) else self.code.constant(one) for one in given]
-        return Number(self.code, getattr(self.code, name)(*values))
-
-    def __add__(self, other: Number | float) -> Number:
-        return self if _equals(other, 0.0) else self._operation("add", self, other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: Number | float) -> Number:
-        return self._operation("sub", self, other)
-
-    def __rsub__(self, other: Number | float) -> Number:
-        return self._operation("sub", other, self)
-
-    def __mul__(self, other: Number | float) -> Any:
-        # Zeros that represent the type of a number.
-        return (
-            other
-            if _equals(other, 0.0)
-            else self
-            if _equals(other, 1.0)
-            else self._operation("mul", self, other)
-        )
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: Number | float) -> Number:
-        return self._operation("div", self, other)
-
-    def __rtruediv__(self, other: Number | float) -> Number:
-        return self._operation("div", other, self)
-
-    def __neg__(self) -> Number:
-        return Number(self.code, self.code.minus(self.value))
-
-    def __lt__(self, other: Number | float) -> Number:
-        return self._operation("below", self, other)
-
-    def __gt__(self, other: Number | float) -> Number:
-        return self._operation("below", other, self)
-
-    def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number | float) -> Any:
-        """Apply NumPy's elementwise functions."""
-        if function in OPERATORS:
-            return OPERATORS[function](*given)
-        require_supported(function, _NAMES)
-        return self._operation(_NAMES[function], *given)
+    def __array_ufunc__(
+        self, function: np.ufunc, _method: str, *given: Number | float, out: Any = None
+    ) -> Any:
+        """Apply a NumPy function or an operator; ``out`` of augmented assignments is not needed."""
+        if function is np.greater:
+            function, given = np.less, given[::-1]
+        if function in (np.add, np.multiply):
+            one, other = given if isinstance(given[0], Number) else given[::-1]
+            neutral = 0.0 if function is np.add else 1.0
+            # Zeros that represent the type of a number.
+            if not isinstance(other, Number) and other in (0.0, neutral):
+                return one if other == neutral else other
+            given = one, other
+        return self.__array_function__(function, None, given, None)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Number:
         """Implement :func:`numpy.where`."""
-        require_supported(function, {np.where: "where"})
-        return self._operation("chosen", *given)
-
-
-_NAMES = {np.sqrt: "root", np.minimum: "least", np.maximum: "most", np.exp: "exp", np.log: "log"}
-"""Methods of :class:`Code` for NumPy's functions."""
-
-
-def _equals(other: Number | float, number: float) -> bool:
-    return not isinstance(other, Number) and other == number
+        require_supported(function)
+        values = [one.value if isinstance(one, Number) else self.code.constant(one) for one in given]
+        return Number(self.code, getattr(self.code, function.__name__)(*values))

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from functools import partial
+from itertools import chain, islice
 from typing import Any
 
 from llvmlite import ir
@@ -43,28 +44,29 @@ def scattered_matrix(tau: Sequence[Any], c: Sequence[Any], stress_scale: Any, ma
 
 def pulled_back(
     function: Callable[..., tuple[Sequence[Any], Sequence[Any]]],
-    given: Sequence[Any],
+    given: Sequence[Sequence[Any]],
     fixed: Sequence[Any],
     bars: Sequence[Any],
     known: Sequence[Any] = (),
-) -> list[Any]:
-    """Return the adjoints of the numbers ``given``, from the adjoints ``bars`` of a function's results.
+) -> list[list[Any]]:
+    """Return the adjoints of groups of numbers ``given``, from the adjoints ``bars`` of a function's results.
 
     Args:
-        function: Maps two lists, ``given`` and ``fixed`` numbers, to results and intermediate
-            results.
+        function: Maps the groups and the ``fixed`` numbers to results and intermediate results.
         given: Numbers with adjoints.
         fixed: Numbers without adjoints.
         bars: Adjoints of the results.
         known: Values of the intermediate results.
     """
-    trace = Trace(getattr(given[0], "single", False))
-    inputs, others = trace.inputs("given", len(given)), trace.inputs("fixed", len(fixed))
+    trace = Trace(getattr(given[0][0], "single", False))
+    groups = [trace.inputs(f"given {k} ", len(group)) for k, group in enumerate(given)]
+    inputs, others = list(chain(*groups)), trace.inputs("fixed", len(fixed))
     own = trace.inputs("bars", len(bars))
-    results, intermediate = function(inputs, others)
-    values = dict(zip([*inputs, *others, *own], [*given, *fixed, *bars], strict=True))
+    results, intermediate = function(*groups, *others)
+    values = dict(zip([*inputs, *others, *own], [*chain(*given), *fixed, *bars], strict=True))
     values |= dict(zip(intermediate, known, strict=True))
-    return evaluated(derivatives(results, own, inputs), values)
+    out = iter(evaluated(derivatives(results, own, inputs), values))
+    return [list(islice(out, len(group))) for group in given]
 
 
 def law_adjoint(
@@ -75,17 +77,15 @@ def law_adjoint(
     constants: Sequence[Any],
     a_bar: Sequence[Any],
     f_bar: Sequence[Any],
-) -> tuple[list[Any], list[Any], list[Any]]:
+) -> list[list[Any]]:
     """Return the adjoints of C (9), F (9) and the coefficients, given the adjoints of A (9) and the new F
     (9); ``constants`` are the time step, the scale of the stress in A, and the mass."""
 
-    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
-        dt, scale, mass = fixed
-        tau, f_new = law.update(x[:9], x[9:18], dt, *x[18:])
-        return [*scattered_matrix(tau, x[:9], scale, mass), *f_new], []
+    def outputs(c: Any, f: Any, own: Any, dt: Any, scale: Any, mass: Any) -> tuple[list[Any], list[Any]]:
+        tau, f_new = law.update(c, f, dt, *own)
+        return [*scattered_matrix(tau, c, scale, mass), *f_new], []
 
-    out = pulled_back(outputs, [*c, *f, *parameters], constants, [*a_bar, *f_bar])
-    return out[:9], out[9:18], out[18:]
+    return pulled_back(outputs, [c, f, parameters], constants, [*a_bar, *f_bar])
 
 
 class TracedSeries(algebra.Series):
@@ -104,46 +104,43 @@ def stress_adjoint(
     a_bar: Sequence[Any],
     scale: Any,
     series: Any,
-) -> tuple[list[Any], Any, Any, list[Any]]:
-    """Return the contributions of the stress to the adjoints of d (6), c2, J and the parameters (3), given
-    the adjoint of A (9)."""
+) -> list[list[Any]]:
+    """Return the contributions of the stress to the adjoints of d (6), c2 and J (2) and the parameters (3),
+    given the adjoint of A (9)."""
 
-    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
-        mu, lam, limit = x[8:]
-        tau = von_mises.stress(x[:6], x[7], x[6], mu, lam, limit, series)
-        return scattered_matrix(tau, [0.0] * 9, fixed[0], 0.0), []
+    def outputs(d: Any, scalars: Any, own: Any, scale: Any) -> tuple[list[Any], list[Any]]:
+        (c2, j), (mu, lam, limit) = scalars, own
+        tau = von_mises.stress(d, j, c2, mu, lam, limit, series)
+        return scattered_matrix(tau, [0.0] * 9, scale, 0.0), []
 
-    out = pulled_back(outputs, [*d, c2, j, *parameters], [scale], a_bar)
-    return out[:6], out[6], out[7], out[8:]
+    return pulled_back(outputs, [d, [c2, j], parameters], [scale], a_bar)
 
 
 def flow_adjoint(
     d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: Any
-) -> tuple[list[Any], list[Any], Any]:
-    """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain, given
-    the adjoint of the new F."""
+) -> list[list[Any]]:
+    """Return the contributions of plastic flow to the adjoints of d (6), G (9) and the yield strain (1),
+    given the adjoint of the new F."""
 
-    def outputs(x: Any, _fixed: Any) -> tuple[list[Any], list[Any]]:
-        return von_mises.flow(x[:6], x[6:15], x[15], series), []
+    def outputs(d: Any, g: Any, own: Any) -> tuple[Sequence[Any], list[Any]]:
+        return von_mises.flow(d, g, own[0], series), []
 
-    out = pulled_back(outputs, [*d, *g, yield_strain], [], f_bar)
-    return out[:6], out[6:15], out[15]
+    return pulled_back(outputs, [d, g, [yield_strain]], [], f_bar)
 
 
 def strain_adjoint(
     c: Sequence[Any], f: Sequence[Any], dt: Any, known: Sequence[Any], bars: Sequence[Any], series: Any
-) -> tuple[list[Any], list[Any]]:
+) -> list[list[Any]]:
     """Return the contributions of the strain to the adjoints of C and F (9 each), given those of G (9), J, c2
     and d (6); ``known`` holds G, J, c2, W (6), Z (6), a1, a2 and d, computed from C and F."""
 
-    def outputs(x: Any, fixed: Any) -> tuple[list[Any], list[Any]]:
-        g = algebra.trial_gradient(x[:9], x[9:], fixed[0])
+    def outputs(c: Any, f: Any, dt: Any) -> tuple[list[Any], list[Any]]:
+        g = algebra.trial_gradient(c, f, dt)
         j = algebra.det(g)
         c2, w, z, _z2, a1, a2, d = von_mises.hencky_strain(g, j, TracedSeries(*astuple(series)))
         return [*g, j, c2, *d], [*g, j, c2, *w, *z, a1, a2, *d]
 
-    out = pulled_back(outputs, [*c, *f], [dt], bars, known)
-    return out[:9], out[9:]
+    return pulled_back(outputs, [c, f], [dt], bars, known)
 
 
 # -- tiles and particles -------------------------------------------------------------------------------------
@@ -223,7 +220,7 @@ class Tile:
         for k, one in enumerate(values):
             value = one.value if isinstance(one, Number) else self.code.constant(one)
             if self._own is not None and array != "strains":
-                value = self.code.chosen(self._own, value, self.code.lane_vector(place, first + k))
+                value = self.code.where(self._own, value, self.code.lane_vector(place, first + k))
             self.code.put_lane_vector(place, first + k, value)
 
     def note(self, name: str, *conditions: ir.Value) -> None:
@@ -235,7 +232,7 @@ class Tile:
     def note_yield(self, d: Sequence[Number], yield_strain: Number) -> None:
         """Record in ``rigid`` whether no lane yields."""
         factor = von_mises.yield_factor(d, yield_strain)[3]
-        self.note("rigid", self.code.below(self.code.constant(1.0), factor.value, equal=True))
+        self.note("rigid", self.code.less(self.code.constant(1.0), factor.value, equal=True))
 
 
 class Particle:
@@ -266,7 +263,7 @@ class Particle:
     def is_yielding(self, d: Sequence[Number], limit: Number) -> ir.Value:
         """Return whether the factor of return mapping is below 1."""
         factor = von_mises.yield_factor(d, limit)[3]
-        return self.code.below(factor.value, self.code.constant(1.0))
+        return self.code.less(factor.value, self.code.constant(1.0))
 
 
 def series_of(real: ir.Type) -> algebra.Series:
@@ -300,9 +297,9 @@ def strain(one: Tile | Particle) -> tuple[Any, ...]:
     g = algebra.trial_gradient(one.take("c"), one.take("f"), one.number("dt"))
     j = algebra.det(g)
     found, code = von_mises.hencky_strain(g, j, one.series), one.code
-    above = code.below(found[3].value, one.number("z_squared_max").value, equal=True)
-    low = code.below(one.number("j_min").value, j.value, equal=True)
-    high = code.below(j.value, one.number("j_max").value, equal=True)
+    above = code.less(found[3].value, one.number("z_squared_max").value, equal=True)
+    low = code.less(one.number("j_min").value, j.value, equal=True)
+    high = code.less(j.value, one.number("j_max").value, equal=True)
     return g, j, found, (above, low, high)
 
 
@@ -336,7 +333,7 @@ def tile_stress_adjoint(tile: Tile) -> None:
     """Adjoint of a tile's stress, given the adjoint of A; ``rigid`` is 1 if no lane yields."""
     d, (j, c2), a_bar = tile.take("d"), tile.take("scalars"), tile.take("a_bar")
     parameters, scale = tile.take("p"), tile.number("stress_scale")
-    d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
+    d_bar, (c2_bar, j_bar), bars = stress_adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
     for key, values in (("d_bar", d_bar), ("scalar_bars", [j_bar, c2_bar]), ("p_bar", bars)):
         tile.leave(key, values)
     tile.note_yield(d, parameters[2])
@@ -345,7 +342,7 @@ def tile_stress_adjoint(tile: Tile) -> None:
 def tile_flow_adjoint(tile: Tile) -> None:
     """Adjoint of a tile's plastic flow, given that of the new F; added to the adjoint of the stress."""
     d, g, f_bar = tile.take("d"), tile.take("g"), tile.take("f_new_bar")
-    d_bar, g_bar, limit_bar = flow_adjoint(d, g, tile.take("p")[2], f_bar, tile.series)
+    d_bar, g_bar, (limit_bar,) = flow_adjoint(d, g, tile.take("p")[2], f_bar, tile.series)
     tile.leave("d_bar", [a + b for a, b in zip(tile.take("d_bar"), d_bar, strict=True)])
     tile.leave("g_bar", g_bar)
     tile.leave("limit_bar", [tile.take("limit_bar")[0] + limit_bar])
@@ -392,7 +389,7 @@ def particle(law: Law, one: Particle) -> None:
             scale, mass = one.number("stress_scale"), one.number("mass")
             one.leave("a", scattered_matrix(tau, one.take("c"), scale, mass))
             one.leave("f_new", g)
-            with code.where(one.is_yielding(d, limit)):
+            with code.when(one.is_yielding(d, limit)):
                 one.leave("f_new", von_mises.flow(d, g, limit, one.series))
         with outside:
             update(law, True, one)
@@ -405,10 +402,11 @@ def particle_adjoint(law: Law, one: Particle) -> None:
     with code.either(code.all_of(*fits)) as (inside, outside):
         with inside:
             scale = one.number("stress_scale")
-            d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
+            own = (mu, lam, limit)
+            d_bar, (c2_bar, j_bar), bars = stress_adjoint(d, j, c2, own, a_bar, scale, one.series)
             kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
-            with code.where(one.is_yielding(d, limit)):
-                d_flow, g_flow, limit_flow = flow_adjoint(d, g, limit, g_bar, one.series)
+            with code.when(one.is_yielding(d, limit)):
+                d_flow, g_flow, (limit_flow,) = flow_adjoint(d, g, limit, g_bar, one.series)
                 sums = [x + y for x, y in zip((*d_bar, bars[2]), (*d_flow, limit_flow), strict=True)]
                 code.set_variables(kept, [x.value for x in (*sums, *g_flow)])
             *d_bar, bars[2] = (Number(code, value) for value in code.values(kept[:7]))

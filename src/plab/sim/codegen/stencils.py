@@ -20,13 +20,13 @@ from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, MOMENTUM_FIELD, OFFSETS,
 
 def rows_of(code: Code, grid: ir.Value) -> list[list[ir.Value]]:
     """Return the addresses of a stencil's rows by offset along x and y; ``grid`` is the base node."""
-    along_y = code.mul_word(code.args["axis"], WORD(4))
-    along_x = code.mul_word(along_y, code.args["axis"])
+    along_y = code.multiply_word(code.args["axis"], WORD(4))
+    along_x = code.multiply_word(along_y, code.args["axis"])
     out: list[list[ir.Value]] = []
     for i in range(3):
-        first = code.moved(out[i - 1][0], along_x) if i else grid
-        second = code.moved(first, along_y)
-        out.append([first, second, code.moved(second, along_y)])
+        first = code.at(out[i - 1][0], along_x) if i else grid
+        second = code.at(first, along_y)
+        out.append([first, second, code.at(second, along_y)])
     return out
 
 
@@ -43,7 +43,9 @@ class Stencil(Code):
         """Row of an affine field at the base node, and its increments along x and y, given the field's value
         (4) at that node and the columns (3) of a matrix times a scale."""
         base = self.vector(value)
-        x, y, z = (self.mul(self.vector([*one, self.real(0.0)]), self.splat(scale, 4)) for one in columns)
+        x, y, z = (
+            self.multiply(self.vector([*one, self.real(0.0)]), self.splat(scale, 4)) for one in columns
+        )
         second = self.add(base, z)
         return [self.row(base, second, self.add(second, z)), self.row(x, x, x), self.row(y, y, y)]
 
@@ -106,10 +108,10 @@ def scatter(module: ir.Module, name: str, real: ir.Type) -> None:
     value = [*code.lanes(args["value"], 0), args["last"]]
     field = code.field(value, [code.lanes(args["matrix"], j, step=3) for j in range(3)], args["scale"])
     z = code.row(*(code.splat(weight, 4) for weight in w[2]))
-    weighted = [code.both(code.mul, row, z) for row in field]
+    weighted = [code.both(code.multiply, row, z) for row in field]
     for wx, rows, values in zip(w[0], rows_of(code, args["grid"]), code.over(weighted), strict=True):
         for wy, place, row in zip(w[1], rows, values, strict=True):
-            code.write(place, code.times(row, code.mul(wx, wy), code.read(place)))
+            code.write(place, code.times(row, code.multiply(wx, wy), code.read(place)))
     code.end()
 
 
@@ -124,12 +126,14 @@ def gather(module: ir.Module, name: str, real: ir.Type) -> None:
     m0, *along = code.moments(sums, w[2])
     x, v = code.lanes(args["source"], 0), [code.number(m0, i) for i in range(3)]
     for j, (moment, offset) in enumerate(zip(along, code.lanes(args["stencil"], OFFSETS), strict=True)):
-        c = code.mul(code.splat(args["scale"], 4), code.sub(moment, code.mul(code.splat(offset, 4), m0)))
+        c = code.multiply(
+            code.splat(args["scale"], 4), code.subtract(moment, code.multiply(code.splat(offset, 4), m0))
+        )
         for i in range(3):
             code.put_lane(args["target"], AT_C + 3 * i + j, code.number(c, i))
     for i in range(3):
-        moved = code.add(x[i], code.mul(args["dt"], v[i]))
-        code.put_lane(args["target"], i, code.least(code.most(moved, real(0.0)), args["end"]))
+        moved = code.add(x[i], code.multiply(args["dt"], v[i]))
+        code.put_lane(args["target"], i, code.minimum(code.maximum(moved, real(0.0)), args["end"]))
         code.put_lane(args["target"], AT_V + i, v[i])
     code.put("speed", code.dot(v, v))
     code.end()
@@ -143,7 +147,7 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     )
     args, w, dw = code.args, code.weights(WEIGHTS), code.weights(SLOPES)
     dx, inverse, bar, matrix = args["dx"], args["inverse"], args["bar"], args["matrix"]
-    four = code.mul(real(4.0), inverse)
+    four = code.multiply(real(4.0), inverse)
     a, c = code.lanes(matrix, 0, 9), code.lanes(bar, AT_C, 9)
     value = [*code.lanes(args["stencil"], MOMENTUM_FIELD), args["mass"]]
     momentum = code.field(value, [a[j::3] for j in range(3)], dx)
@@ -157,8 +161,8 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
         along: Any = None
         sloping: Any = None
         for j in range(3):
-            product = code.both(code.mul, code.read(grids[0][i][j]), h[j])
-            product = code.both(code.add, code.both(code.mul, of_momentum[j], q[j]), product)
+            product = code.both(code.multiply, code.read(grids[0][i][j]), h[j])
+            product = code.both(code.add, code.both(code.multiply, of_momentum[j], q[j]), product)
             along, sloping = code.times(product, w[1][j], along), code.times(product, dw[1][j], sloping)
         factors = (along, dw[0][i]), (sloping, w[0][i]), (along, w[0][i])
         slopes = [code.times(row, by, to) for (row, by), to in zip(factors, slopes, strict=True)]
@@ -169,14 +173,16 @@ def gather_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     own = [code.number(m0, i) for i in range(3)]
     offset = code.lanes(args["stencil"], OFFSETS)
     for i in range(3):
-        lost = code.dot([code.mul(code.mul(four, inverse), one) for one in c[i::3]], v)
+        lost = code.dot([code.multiply(code.multiply(four, inverse), one) for one in c[i::3]], v)
         lost = code.add(lost, code.dot(a[i::3], own))
         steep = reduce(code.add, [code.number(slope[i], k) for k in range(4)])
-        kept = code.inside(code.add(x[i], code.mul(args["dt"], v[i])), args["end"], code.lane(bar, i))
-        code.put_lane(bar, i, code.sub(code.add(kept, code.mul(inverse, steep)), lost))
-        code.put_lane(bar, AT_V + i, code.mul(args["mass"], own[i]))
+        kept = code.inside(code.add(x[i], code.multiply(args["dt"], v[i])), args["end"], code.lane(bar, i))
+        code.put_lane(bar, i, code.subtract(code.add(kept, code.multiply(inverse, steep)), lost))
+        code.put_lane(bar, AT_V + i, code.multiply(args["mass"], own[i]))
     for j in range(3):
-        a_bar = code.mul(code.splat(dx, 4), code.sub(moments[j], code.mul(code.splat(offset[j], 4), m0)))
+        a_bar = code.multiply(
+            code.splat(dx, 4), code.subtract(moments[j], code.multiply(code.splat(offset[j], 4), m0))
+        )
         for i in range(3):
             code.put_lane(matrix, 3 * i + j, code.number(a_bar, i))
     code.end()
