@@ -92,9 +92,6 @@ LANES = {"cpu": 8, "cuda": 32}
 BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
 """Bytes of a number by its type."""
 
-PIECE = 1 << 21
-"""Entries of a field that are copied between host and device at a time."""
-
 
 class Storage:
     """Fields and constants shared by all phases of a substep; see the module docstring for the layout."""
@@ -111,8 +108,8 @@ class Storage:
         which :meth:`fill_parameters` writes. With ``full_gradient`` gradients include those with respect to
         initial state and material. The CPU is always ``deterministic``. With ``singular_values`` the series
         of :mod:`plab.laws.von_mises` are not used."""
-        # Fields that the host reads or writes: number, field, components.
-        self.shared: list[tuple[int, ti.Field, int]] = []
+        # Fields that the host reads or writes: number, field, index of the first entry.
+        self.shared: list[tuple[int, ti.Field, tuple[int, ...]]] = []
         self._addresses: np.ndarray | None = None
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
         self.adjoint_sums: list[tuple[ti.Field, int]] = []
@@ -319,56 +316,32 @@ class Storage:
     # copies have one for each field.
 
     def share(self, field: ti.Field) -> ti.Field:
-        """Register a field and return it. Call before the first kernel is compiled.
-
-        :meth:`write` takes fields of numbers or vectors with one or two dimensions, :meth:`read` those of
-        numbers with one dimension.
-        """
-        self.shared.append((len(self.shared), field, getattr(field, "n", 0)))
+        """Register a field of numbers or vectors, which :meth:`write` takes and, if it has numbers,
+        :meth:`read`; return it. Call before the first kernel is compiled."""
+        self.shared.append((len(self.shared), field, (0,) * len(field.shape)))
         return field
 
     def read(self, field: ti.Field) -> np.ndarray:
-        """Return all entries of a shared one-dimensional field of numbers."""
-        if self._addresses is None:
-            self._addresses = np.zeros(len(self.shared), np.int64)
-            self._find_fields(self._addresses)
+        """Return all entries of a shared field of numbers."""
         out = np.zeros(field.shape, NUMPY_TYPES[field.dtype])
-        copy_memory(int(self._addresses[self._number_of(field)]), out, False)
+        copy_memory(self._address_of(field), out, False)
         return out.astype(np.float64)
-
-    @ti.kernel
-    def _find_fields(self, out: Array):
-        for number, field, size in ti.static(self.shared):
-            if ti.static(size == 0 and len(field.shape) == 1):
-                out[number] = ti.cast(ti.get_addr(field, 0), ti.i64)
-
-    def _number_of(self, field: ti.Field) -> int:
-        return next(number for number, own, _ in self.shared if own is field)
 
     def write(self, field: ti.Field, values: ArrayLike) -> None:
         """Write all entries of a shared field, given numbers with the field's leading shape."""
-        numbers, entries = np.asarray(values).reshape(-1), math.prod(field.shape)
-        size = numbers.size // entries
-        for first in range(0, entries, PIECE):
-            count = min(PIECE, entries - first)
-            # Copy, because Taichi assumes that kernels write to their arrays.
-            piece = numbers[first * size : (first + count) * size].astype(np.float64)
-            self.write_entries(self._number_of(field), piece, first, count)
+        with np.errstate(over="ignore"):
+            numbers = np.ascontiguousarray(values, NUMPY_TYPES[field.dtype])
+        assert numbers.size == math.prod(field.shape) * getattr(field, "n", 1)
+        copy_memory(self._address_of(field), numbers, True)
+
+    def _address_of(self, field: ti.Field) -> int:
+        if self._addresses is None:
+            self._addresses = np.zeros(len(self.shared), np.int64)
+            self._find_fields(self._addresses)
+        return int(self._addresses[next(number for number, own, _ in self.shared if own is field)])
 
     @ti.kernel
-    def write_entries(self, which: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
-        """Copy an array to some entries of the shared field with this number."""
-        for i in range(count):
-            for number, field, size in ti.static(self.shared):
-                if which == number:
-                    at = first + i
-                    row, column = at // field.shape[-1], at % field.shape[-1]
-                    if ti.static(size == 0 and len(field.shape) == 1):
-                        field[at] = ti.cast(numbers[i], field.dtype)
-                    elif ti.static(size == 0):
-                        field[row, column] = ti.cast(numbers[i], field.dtype)
-                    for c in ti.static(range(size)):
-                        if ti.static(len(field.shape) == 1):
-                            field[at][c] = ti.cast(numbers[i * size + c], field.dtype)
-                        else:
-                            field[row, column][c] = ti.cast(numbers[i * size + c], field.dtype)
+    def _find_fields(self, out: Array):
+        """Write the addresses of the shared fields."""
+        for number, field, first in ti.static(self.shared):
+            out[number] = ti.cast(ti.get_addr(field, first), ti.i64)
