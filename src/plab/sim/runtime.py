@@ -123,18 +123,18 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         raise ArgumentError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     # Threads at barriers can wait indefinitely for threads without a CPU.
     wanted = 1 if device == "cuda" else max(1, min(threads or available_threads(), _cpus()))
+    asked = Runtime(device, precision, wanted)
     # Taichi's cache identifies kernels by the numbers of fields, so the count restarts when no simulator is
     # left.
-    if _current is not None and len(_users) > 0:
-        if (_current.device, _current.precision, _current.threads) == (device, precision, wanted):
-            # Some may only await garbage collection.
-            gc.collect()
-            if len(_users) > 0:
-                while _dropped:
-                    runtime, handle = _dropped.pop()
-                    if runtime is _current:
-                        free_fields(handle)
-                return _current
+    if _current is not None and _current == asked and len(_users) > 0:
+        # Some may only await garbage collection.
+        gc.collect()
+        if len(_users) > 0:
+            while _dropped:
+                runtime, handle = _dropped.pop()
+                if runtime is _current:
+                    free_fields(handle)
+            return _current
     if device == "cuda" and not cuda_available():
         raise DeviceError(
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
@@ -162,8 +162,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     clear_kernel_arguments()
     guard_array_release()
     defer_position_lookup()
-    _current = Runtime(device, precision, wanted)
-    return _current
+    _current = asked
+    return asked
 
 
 def _refuse_fork() -> None:

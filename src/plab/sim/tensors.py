@@ -150,14 +150,11 @@ def kernel_actions(
     count = numbers.shape[0]
     if on_device(numbers) and not (engine.cuda and count):
         numbers = numbers.cpu().numpy()
-    stays = on_device(numbers)
-    if stays and not rollout and _in_default_stream():
-        return numbers
-    if not (rollout or stays):
+    elsewhere = on_device(numbers) and not _in_default_stream()
+    if not rollout and not elsewhere:
         return numbers
     # Another stream might reuse a tensor's memory before the kernels have read it.
     array = ti.ndarray(ti.f64, shape=max(1, count))
-    elsewhere = stays and not _in_default_stream()
     if elsewhere:
         # Wait for the actions of the manipulators.
         sys.modules["torch"].cuda.current_stream().synchronize()
