@@ -266,12 +266,10 @@ def compiled(device: str, precision: str, law: Law, mixed: bool = False):
 def test_compiled_laws_compute_their_formulas(name: str, strain: float, precision: str) -> None:
     """Check a tile on the CPU, a tile with two laws, and a particle on CUDA, forward and adjoint; von Mises
     plasticity on CUDA by series and by singular values."""
-    from plab.sim import storage
     from plab.sim.codegen.materials import law_adjoint
-    from plab.sim.storage import AT_C, AT_F, STATE, STRAIN_LAW, STRAINS
+    from plab.sim.storage import AT_C, AT_F, LAW_PARAMETER_BARS, LAW_PARAMETERS, STATE, STRAIN_LAW, STRAINS
 
-    law, lanes, kept = ALL[name], 8, "STRAIN" if name == "von_mises" else "LAW"
-    first, first_bar = getattr(storage, f"{kept}_PARAMETERS"), getattr(storage, f"{kept}_PARAMETER_BARS")
+    law, lanes = ALL[name], 8
     kind, tolerance = (np.float32, 1e-4) if precision == "f32" else (np.float64, 1e-13)
     rng = np.random.default_rng(3)
     state, bar = rng.normal(size=(2, STATE, lanes)).astype(kind)
@@ -291,7 +289,7 @@ def test_compiled_laws_compute_their_formulas(name: str, strain: float, precisio
     numbers = [np.array([value], kind) for value in (1.0, *CONSTANTS)]
     for mixed in (False, True):
         strains, out, new = np.zeros((STRAINS, lanes), kind), np.zeros((9, lanes), kind), state.copy()
-        strains[first : first + law.size] = np.array(own)[:, None]
+        strains[LAW_PARAMETERS : LAW_PARAMETERS + law.size] = np.array(own)[:, None]
         mine = np.arange(lanes) % 3 > 0 if mixed else np.full(lanes, True)
         strains[STRAIN_LAW] = mine
         call = compiled("cpu", precision, law, mixed)
@@ -306,7 +304,7 @@ def test_compiled_laws_compute_their_formulas(name: str, strain: float, precisio
         close(given[AT_C:AT_F, mine], c_bar[:, mine])
         close(given[AT_F:, mine], f_bar[:, mine])
         assert (given[:, ~mine] == bar[:, ~mine]).all()
-        bars = strains[first_bar : first_bar + law.size]
+        bars = strains[LAW_PARAMETER_BARS : LAW_PARAMETER_BARS + law.size]
         close(bars[:, mine] * np.array(own)[:, None], own_bar[:, mine] * np.array(own)[:, None])
     call, series = compiled("cuda", precision, law), Series.for_precision(f"float{precision[1:]}")
     if name == "von_mises":

@@ -33,8 +33,6 @@ from plab.sim.storage import (
     STATE,
     STENCILS,
     STRAIN_LAW,
-    STRAIN_PARAMETER_BARS,
-    STRAIN_PARAMETERS,
     STRAINS,
     WEIGHTS,
 )
@@ -267,15 +265,6 @@ class TilePhases(ParticlePhases):
             return True
 
     @ti.func
-    def put_parameters(self, e, entry9, at, first: ti.template(), count: ti.template()):
-        """Write a tile's coefficients and, with several laws, each lane's law number to ``strains``."""
-        p = self.parameters_of_tile(e, entry9)
-        for i in ti.static(range(count)):
-            self.strains[at + first + i] = p[i]
-        if ti.static(len(self.laws) > 1):
-            self.strains[at + STRAIN_LAW] = p[self.coefficients]
-
-    @ti.func
     def law_places(self, state_at, source, last_at, last, entry9, at):
         """Addresses that a law's functions take: the tile in ``strains``, in the state and in ``affine``, and
         its first lane vector ``last`` in another array."""
@@ -307,22 +296,19 @@ class TilePhases(ParticlePhases):
 
     @ti.func
     def in_series(self, first, x, e, entry9, at, number: ti.template(), kind: ti.template()):
-        """Write a tile's parameters to ``strains``; return whether the law has a series and all lanes are in
-        its range. Then also write the strain, with ``whole_strain`` the intermediate results for the
-        adjoint."""
-        place = ti.static(self.first_parameter(number, False))
-        self.put_parameters(e, entry9, at, place, self.laws[number].size)
+        """Write a tile's parameters and, with several laws, each lane's law number to ``strains``; return
+        whether the law has a series and all lanes are in its range. Then also write the strain, with
+        ``whole_strain`` the intermediate results for the adjoint."""
+        p = self.parameters_of_tile(e, entry9)
+        for i in ti.static(range(self.laws[number].size)):
+            self.strains[at + LAW_PARAMETERS + i] = p[i]
+        if ti.static(len(self.laws) > 1):
+            self.strains[at + STRAIN_LAW] = p[self.coefficients]
         if ti.static(self.scheduled(number)):
             limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
             return self.call_returning(number, kind, [first, x], limits) > 0.0
         else:
             return False
-
-    def first_parameter(self, number: int, adjoint: bool) -> int:
-        """Return the first entry of a law's coefficients or their adjoints in ``strains``."""
-        if self.scheduled(number):
-            return STRAIN_PARAMETER_BARS if adjoint else STRAIN_PARAMETERS
-        return LAW_PARAMETER_BARS if adjoint else LAW_PARAMETERS
 
     @ti.func
     def is_own(self, entry9, lane, number: ti.template()):
@@ -357,8 +343,7 @@ class TilePhases(ParticlePhases):
     @ti.func
     def parameter_tile_adjoint(self, entry9, at, number: ti.template()):
         """Add a tile's adjoints of the material's coefficients, from ``strains``."""
-        first = ti.static(self.first_parameter(number, True))
-        bars = [self.strains[at + first + i] for i in range(self.laws[number].size)]
+        bars = [self.strains[at + LAW_PARAMETER_BARS + i] for i in range(self.laws[number].size)]
         if ti.static(self.mixed):
             for lane in range(self.lanes):
                 if self.is_own(entry9, lane, number):

@@ -78,10 +78,8 @@ STRAINS = 56
 
 LAW_PARAMETERS, LAW_PARAMETER_BARS, STRAIN_LAW = 0, 24, 54
 """Entries of a tile among these: the law's coefficients, their adjoints and, where there are several laws,
-the number of each lane's law."""
-
-STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 48, 51
-"""The same under von Mises plasticity; :mod:`plab.sim.codegen.materials` has the other entries."""
+the number of each lane's law. :mod:`plab.sim.codegen.materials` has the entries between them under von Mises
+plasticity."""
 
 GROUND = 4
 """Entries of an environment's material before the law's coefficients: floor friction, gravity (3)."""

@@ -21,15 +21,7 @@ from plab.laws import Law, algebra, von_mises
 from plab.laws.tracing import Primitive, Trace, derivatives, evaluated
 from plab.scenes import LAWS
 from plab.sim.codegen.llvm import LANE, Code, Number, Scalars
-from plab.sim.storage import (
-    AT_C,
-    AT_F,
-    LAW_PARAMETER_BARS,
-    LAW_PARAMETERS,
-    STRAIN_LAW,
-    STRAIN_PARAMETER_BARS,
-    STRAIN_PARAMETERS,
-)
+from plab.sim.storage import AT_C, AT_F, LAW_PARAMETER_BARS, LAW_PARAMETERS, STRAIN_LAW
 
 Maker = Callable[[ir.Module, str, ir.Type], None]
 
@@ -162,16 +154,16 @@ TILE_PLACES = {
     "c_bar": ("bar", AT_C, 9),
     "f_bar": ("bar", AT_F, 9),
     # Under von Mises plasticity, named as in plab.laws.von_mises; scalars are J, c2, coefficients a1, a2.
-    "g": ("strains", 0, 9),
-    "d": ("strains", 9, 6),
-    "w": ("strains", 15, 6),
-    "z": ("strains", 21, 6),
-    "scalars": ("strains", 27, 2),
-    "coefficients": ("strains", 29, 2),
-    "d_bar": ("strains", 31, 6),
-    "scalar_bars": ("strains", 37, 2),
-    "g_bar": ("strains", 39, 9),
-    "limit_bar": ("strains", STRAIN_PARAMETER_BARS + 2, 1),
+    "g": ("strains", LAW_PARAMETERS + 3, 9),
+    "d": ("strains", LAW_PARAMETERS + 12, 6),
+    "w": ("strains", LAW_PARAMETERS + 18, 6),
+    "limit_bar": ("strains", LAW_PARAMETER_BARS + 2, 1),
+    "z": ("strains", LAW_PARAMETER_BARS + 3, 6),
+    "scalars": ("strains", LAW_PARAMETER_BARS + 9, 2),
+    "coefficients": ("strains", LAW_PARAMETER_BARS + 11, 2),
+    "d_bar": ("strains", LAW_PARAMETER_BARS + 13, 6),
+    "scalar_bars": ("strains", LAW_PARAMETER_BARS + 19, 2),
+    "g_bar": ("strains", LAW_PARAMETER_BARS + 21, 9),
 }
 """Array, first entry and number of each input and output of a tile's functions."""
 
@@ -193,12 +185,9 @@ class Tile:
         """Begin a function of addresses and numbers."""
         self.code = Code(module, name, real, f"strains {addresses}", f"own {numbers}", grid=False)
         self.series = series_of(real)
-        scheduled = law is LAWS["von_mises"]
-        first = STRAIN_PARAMETERS if scheduled else LAW_PARAMETERS
-        bars = STRAIN_PARAMETER_BARS if scheduled else LAW_PARAMETER_BARS
         self._places = TILE_PLACES | {
-            "p": ("strains", first, law.size),
-            "p_bar": ("strains", bars, law.size),
+            "p": ("strains", LAW_PARAMETERS, law.size),
+            "p_bar": ("strains", LAW_PARAMETER_BARS, law.size),
         }
         self._own: ir.Value | None = None
         if mixed:
