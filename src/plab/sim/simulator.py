@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -46,12 +47,12 @@ from plab.sim.tensors import (
     output_for,
     to_host,
 )
-from plab.sim.term_phases import LossTerm
 
 if TYPE_CHECKING:
     import torch
 
     from plab.kinematics.actions import JointActions, LinkMotion
+    from plab.losses.term import Term
 
 
 class Simulator:
@@ -81,7 +82,7 @@ class Simulator:
         self,
         scenes: Sequence[Scene],
         *,
-        terms: Sequence[LossTerm] = (),
+        terms: Sequence[Term] = (),
         precision: str = "float32",
         device: str = "cpu",
         memory_mb: float = 4000.0,
@@ -135,7 +136,7 @@ class Simulator:
             self._engine.allocate_impulses()
         self._engine.attach(terms)
         own_fields(self._engine)
-        self.terms: tuple[LossTerm, ...] = tuple(term for term in self._engine.terms if term.weighted)
+        self.terms: tuple[Term, ...] = tuple(term for term in self._engine.terms if term.weighted)
         self._engine.fill_parameters(self.scenes)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
@@ -408,10 +409,21 @@ class Simulator:
         """Return the mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
         self._require_runtime()
         self._particles.losses(self._scratch_terms, 0)
-        n = self.grid_size
-        out = np.zeros(self.batch * n**3, self._numpy_real)
+        return self._mass(None).astype(np.float64)
+
+    def _mass(self, like: torch.Tensor | None) -> Any:
+        """Return the mass tensors of the last losses, as an array or as a tensor like a CUDA tensor."""
+        shape = self.batch, self.grid_size, self.grid_size, self.grid_size
+        if on_device(like):
+            double = self.precision == "float64"
+            # The kernel writes only nodes with mass.
+            mass = output_for(
+                lambda out: self._engine.export_mass(out.zero_()), math.prod(shape), double, like
+            )
+            return mass.reshape(shape)
+        out = np.zeros(math.prod(shape), self._numpy_real)
         self._engine.export_mass(out)
-        return out.reshape(self.batch, n, n, n).astype(np.float64)
+        return out.reshape(shape)
 
     # -- state --------------------------------------------------------------------------------------
 

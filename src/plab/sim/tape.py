@@ -15,7 +15,7 @@ from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
 from plab.sim.state import broken_gradients, broken_states, require_none
 from plab.sim.storage import AT_V
-from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device, output_for
+from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device
 
 if TYPE_CHECKING:
     import torch
@@ -309,29 +309,18 @@ def record(
     rows: list[Any] = []
     masses: list[Any] = []
 
-    def filled(size: int, fill: Callable[[Any], None]) -> Any:
-        """Return an array or a tensor of zeros, shape [batch, number], to which a kernel has added."""
-        double = engine.real == ti.f64
-        if on_device(actions):
-            return output_for(lambda out: fill(out.zero_()), size, double, actions).reshape(engine.batch, -1)
-        out = np.zeros(size, np.float64 if double else np.float32)
-        fill(out)
-        return out.reshape(engine.batch, -1)
-
     def note(t: int, state: ti.Ndarray, slot: int) -> None:
         if t < first:
             return
         numbers.append(particles.noted_order())
-        size = engine.batch * engine.particles * 6
-        rows.append(filled(size, lambda out: engine.observe(state, slot, numbers[-1], 1, out)))
+        rows.append(simulator._observe(state, slot, 1, actions))
         if with_mass:
-            particles.losses(ti.ndarray(ti.f64, shape=engine.batch * engine.measures), 0, state, slot)
-            masses.append(filled(engine.batch * engine.n**3, engine.export_mass))
+            particles.losses(simulator._scratch_terms, 0, state, slot)
+            masses.append(simulator._mass(actions))
 
-    def stacked(parts: list[Any], *shape: int) -> Any:
+    def stacked(parts: list[Any]) -> Any:
         # A tensor implies that PyTorch is imported.
-        joined = sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
-        return joined.reshape(engine.batch, -1, *shape)
+        return sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
 
     tape.forward(array, poses, None, steps, plan, after=note)
     require_none(broken_states(engine.read(engine.fault), engine.substeps))
@@ -368,8 +357,7 @@ def record(
         require_none(broken_gradients(bar))
         return bar
 
-    moved = stacked(rows, engine.particles, 6)
-    mass = stacked(masses, engine.n, engine.n, engine.n) if with_mass else None
+    moved, mass = stacked(rows), stacked(masses) if with_mass else None
     return RecordedStates(moved[..., :3], moved[..., 3:], shown[1:].swapaxes(0, 1)[:, first:], mass, back)
 
 

@@ -10,9 +10,7 @@ particles near a lower face have negative weights, and nodes may have negative m
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
@@ -22,23 +20,12 @@ from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
 
+if TYPE_CHECKING:
+    from plab.losses.term import Term
+
 EXTRA_MEASURES = 2
 """Measures of a state after its terms: the largest mass of a node, and the substep of divergence, counted
 from 1, or 0."""
-
-
-class LossTerm(Protocol):
-    """Interface of a loss term of any kind, see :mod:`plab.losses.term`."""
-
-    name: str
-    label: str
-    unit: str
-    weight: float
-    weighted: bool
-
-    def attach(self, sim: Any) -> None: ...
-
-    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None: ...
 
 
 class TermPhases(Storage):
@@ -54,12 +41,12 @@ class TermPhases(Storage):
     """
 
     shares: int
-    terms: tuple[LossTerm, ...] = ()
+    terms: "tuple[Term, ...]" = ()
     node_terms: tuple[tuple[int, int, Any], ...] = ()
     particle_terms: tuple[tuple[int, int, Any], ...] = ()
     distance_terms: tuple[tuple[int, int, Any], ...] = ()
 
-    def attach(self, terms: Sequence[LossTerm]) -> None:
+    def attach(self, terms: "Sequence[Term]") -> None:
         """Attach the terms. Call before the first kernel is compiled.
 
         Args:
