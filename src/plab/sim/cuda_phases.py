@@ -25,7 +25,7 @@ from plab.sim.cuda_warp import (
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.motion import PosePhases, vec7
 from plab.sim.particle_phases import spline, spline_slope, widen
-from plab.sim.shapes import signed_distance
+from plab.sim.shapes import SURFACES
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT, WORLD
 
 DISTANCE_GROUPS = 256
@@ -314,7 +314,7 @@ class CudaPhases(OrderPhases, PosePhases):
                     asked = near & (1 << m)
                 if asked:
                     p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
-                    d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+                    d, _n = SURFACES[shape].distance(p, self.size[e, m], self.frame_gap[e, s, m])
                     if self.strength(e, d) > 0.0:
                         mask = mask | (1 << m)
         return mask

@@ -4,7 +4,7 @@ import math
 
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
-from plab.sim.shapes import gap_slope, hessian_product, signed_distance
+from plab.sim.shapes import SURFACES
 from plab.sim.storage import (
     AT_FRAME_GAP,
     AT_FRAME_ROTATION,
@@ -131,7 +131,7 @@ class GridPhases(Storage):
         # Most blocks are outside of the ball around the manipulator.
         if offset.norm() <= self.extent[e, m] + reach:
             p = self.into_frame(shape, e, s, m, offset)
-            d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+            d, _n = SURFACES[shape].distance(p, self.size[e, m], self.frame_gap[e, s, m])
             near = d <= reach
         return near
 
@@ -166,7 +166,7 @@ class GridPhases(Storage):
         """Velocity of a node after contact with manipulator m."""
         out = v
         p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
-        d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+        d, n_local = SURFACES[shape].distance(p, self.size[e, m], self.frame_gap[e, s, m])
         strength = self.strength(e, d)
         if strength > 0.0:
             # Contact with static manipulators does not depend on actions.
@@ -190,7 +190,7 @@ class GridPhases(Storage):
         offset = x - self.frame_centre[e, s, m]
         p = self.into_frame(shape, e, s, m, offset)
         gap = self.frame_gap[e, s, m]
-        d, n_local = signed_distance(shape, p, self.size[e, m], gap)
+        d, n_local = SURFACES[shape].distance(p, self.size[e, m], gap)
         strength = self.strength(e, d)
         if strength > 0.0:
             normal = self.out_of_frame(shape, e, s, m, n_local)
@@ -242,7 +242,7 @@ class GridPhases(Storage):
             size = self.size[e, m]
             gap = self.frame_gap[e, s, m]
             n_bar = self.into_frame(shape, e, s, m, normal_bar)
-            from_distance = d_bar * n_local + hessian_product(shape, p, size, gap, n_bar)
+            from_distance = d_bar * n_local + SURFACES[shape].hessian_product(p, size, gap, n_bar)
             p_bar = from_distance
             if ti.static(self.turns(shape)):
                 p_bar += self.frame_spin[e, s, m].transpose() @ u_bar
@@ -256,7 +256,7 @@ class GridPhases(Storage):
                         frame[AT_FRAME_ROTATION + 3 * i + j] = turned
                         frame[AT_FRAME_SPIN + 3 * i + j] = u_bar[i] * p[j]
             if ti.static(MANIPULATOR_SHAPES[shape].grips):
-                frame[AT_FRAME_GAP] = gap_slope(shape, p) * from_distance[0]
+                frame[AT_FRAME_GAP] = SURFACES[shape].gap_slope(p) * from_distance[0]
 
     @ti.func
     def contacts_adjoint(self, grid_index, e, s, i, free, near, bar):

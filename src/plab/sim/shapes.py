@@ -254,22 +254,3 @@ def require_surfaces(shapes: Iterable[str]) -> None:
         surface = SURFACES.get(shape)
         if surface is None or (MANIPULATOR_SHAPES[shape].grips and surface.gap_slope is None):
             raise SceneError(f"shape '{shape}': complete SURFACES['{shape}'] in plab/sim/shapes.py")
-
-
-@ti.func
-def signed_distance(shape: ti.template(), p, size, gap):
-    """Distance and outward normal of a shape in its own frame; arguments as in :class:`Surface`."""
-    return SURFACES[shape].distance(p, size, gap)
-
-
-@ti.func
-def hessian_product(shape: ti.template(), p, size, gap, w):
-    """Hessian-vector product of a shape's distance in its own frame; arguments as in :class:`Surface`."""
-    return SURFACES[shape].hessian_product(p, size, gap, w)
-
-
-@ti.func
-def gap_slope(shape: ti.template(), p):
-    """Derivative of the x coordinate of the local point, relative to the nearest part of the shape, with
-    respect to the gap."""
-    return SURFACES[shape].gap_slope(p)

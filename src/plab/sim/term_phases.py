@@ -16,7 +16,7 @@ from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint, vec4, vec8
 from plab.sim.particle_phases import spline, spline_slope
-from plab.sim.shapes import gap_slope, signed_distance
+from plab.sim.shapes import SURFACES
 from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
 
@@ -211,7 +211,7 @@ class TermPhases(Storage):
     def end_distance(self, shape: ti.template(), e, m, x):
         """Distance of a world point at the end of the environment step."""
         gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
-        d, _n = signed_distance(shape, self.local_point(shape, e, m, x), self.size[e, m], gap)
+        d, _n = SURFACES[shape].distance(self.local_point(shape, e, m, x), self.size[e, m], gap)
         return d
 
     @ti.func
@@ -222,7 +222,7 @@ class TermPhases(Storage):
         pose = self.pose[e, self.substeps, m]
         gap = ti.cast(pose[7], self.real)
         p = self.local_point(shape, e, m, x)
-        d, n = signed_distance(shape, p, self.size[e, m], gap)
+        d, n = SURFACES[shape].distance(p, self.size[e, m], gap)
         n64 = ti.cast(n, ti.f64)
         d_bar = ti.cast(self.term_weights[column], ti.f64) * term.slope(
             self.accumulator[k, e, m], d, particle
@@ -241,7 +241,7 @@ class TermPhases(Storage):
             for i in ti.static(range(4)):
                 pose_bar[3 + i] = q_bar[i]
         if ti.static(MANIPULATOR_SHAPES[shape].grips):
-            pose_bar[7] = ti.cast(gap_slope(shape, p), ti.f64) * d_bar * n64[0]
+            pose_bar[7] = ti.cast(SURFACES[shape].gap_slope(p), ti.f64) * d_bar * n64[0]
         return ti.cast(x_bar, self.real), pose_bar
 
     @ti.func
