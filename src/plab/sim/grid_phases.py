@@ -349,13 +349,8 @@ class GridPhases(Storage):
     def free_velocity(self, e, total):
         """Velocity of a node of positive mass after gravity, from its momentum and mass."""
         p = self.material[e]
-        return ti.Vector(
-            [
-                total[0] / total[3] + self.dt * p[1],
-                total[1] / total[3] + self.dt * p[2],
-                total[2] / total[3] + self.dt * p[3],
-            ]
-        )
+        gravity = ti.Vector([p[1], p[2], p[3]])
+        return ti.Vector([total[0], total[1], total[2]]) / total[3] + self.dt * gravity
 
     @ti.func
     def after_manipulators(self, e, s, x, v, near, count):

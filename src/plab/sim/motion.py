@@ -18,6 +18,11 @@ mat3 = ti.types.matrix(3, 3, ti.f64)
 
 
 @ti.func
+def quaternion(pose):
+    return vec4(pose[3], pose[4], pose[5], pose[6])
+
+
+@ti.func
 def quat_mul(a, b):
     """Hamilton product of quaternions (w, x, y, z)."""
     return vec4(
@@ -119,9 +124,8 @@ def displacement(motion: ti.template(), pose, u):
     """Displacement in one substep, before clamping."""
     out = vec3(u[0], u[1], u[2])
     if ti.static(motion == "roll"):
-        q = vec4(pose[3], pose[4], pose[5], pose[6])
         # (0, 1, 0) x a0 with a0 = R (0, -1, 0) has no y component.
-        r = rotation_matrix(q)
+        r = rotation_matrix(quaternion(pose))
         out = vec3(-r[2, 1] * u[0] * ROLL_RADIUS, u[2], r[0, 1] * u[0] * ROLL_RADIUS)
     return out
 
@@ -137,7 +141,7 @@ def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
             out[i] = pose[i] + move[i]
             if ti.static(motion != "twist"):
                 out[i] = ti.min(ti.max(out[i], low[i]), high[i])
-        q = vec4(pose[3], pose[4], pose[5], pose[6])
+        q = quaternion(pose)
         if ti.static(motion == "roll"):
             yaw, roll = roll_factors(u)
             q = quat_mul(quat_mul(yaw, q), roll)
@@ -166,8 +170,8 @@ def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap,
                 if target < low[i] or target > high[i]:
                     move_bar[i] = 0.0
             pose_bar[i] = move_bar[i]
-        q = vec4(pose[3], pose[4], pose[5], pose[6])
-        q_bar = vec4(bar[3], bar[4], bar[5], bar[6])
+        q = quaternion(pose)
+        q_bar = quaternion(bar)
         if ti.static(motion == "roll"):
             yaw, roll = roll_factors(u)
             yq = quat_mul(yaw, q)
@@ -208,11 +212,6 @@ def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap,
 
 
 # -- phases -----------------------------------------------------------------------------------------------
-
-
-@ti.func
-def quaternion(pose):
-    return vec4(pose[3], pose[4], pose[5], pose[6])
 
 
 class PosePhases(Storage):
@@ -295,12 +294,12 @@ class PosePhases(Storage):
         r0 = rotation_matrix(quaternion(start))
         r1 = rotation_matrix(quaternion(end))
         inv_dt = ti.cast(1.0, ti.f64) / self.dt
-        for i in ti.static(range(3)):
-            self.frame_centre[e, s, m][i] = ti.cast(start[i], self.real)
-            self.frame_velocity[e, s, m][i] = ti.cast((end[i] - start[i]) * inv_dt, self.real)
-            for j in ti.static(range(3)):
-                self.frame_rotation[e, s, m][i, j] = ti.cast(r0[i, j], self.real)
-                self.frame_spin[e, s, m][i, j] = ti.cast((r1[i, j] - r0[i, j]) * inv_dt, self.real)
+        centre = vec3(start[0], start[1], start[2])
+        moved = vec3(end[0], end[1], end[2]) - centre
+        self.frame_centre[e, s, m] = ti.cast(centre, self.real)
+        self.frame_velocity[e, s, m] = ti.cast(moved * inv_dt, self.real)
+        self.frame_rotation[e, s, m] = ti.cast(r0, self.real)
+        self.frame_spin[e, s, m] = ti.cast((r1 - r0) * inv_dt, self.real)
         self.frame_gap[e, s, m] = ti.cast(start[7], self.real)
 
     @ti.func

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
-from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint, vec4, vec8
+from plab.sim.motion import quaternion, rotation_matrix, rotation_matrix_adjoint, vec8
 from plab.sim.particle_phases import spline, spline_slope
 from plab.sim.shapes import SURFACES
 from plab.sim.storage import AT_V, Storage
@@ -195,8 +195,7 @@ class TermPhases(Storage):
 
     @ti.func
     def pose_rotation(self, e, m):
-        pose = self.pose[e, self.substeps, m]
-        return rotation_matrix(vec4(pose[3], pose[4], pose[5], pose[6]))
+        return rotation_matrix(quaternion(self.pose[e, self.substeps, m]))
 
     @ti.func
     def local_point(self, shape: ti.template(), e, m, x):
@@ -235,9 +234,7 @@ class TermPhases(Storage):
             pose_bar[i] = -x_bar[i]
         if ti.static(self.turns(shape)):
             offset = ti.cast(x, ti.f64) - ti.Vector([pose[0], pose[1], pose[2]])
-            q_bar = rotation_matrix_adjoint(
-                vec4(pose[3], pose[4], pose[5], pose[6]), d_bar * offset.outer_product(n64)
-            )
+            q_bar = rotation_matrix_adjoint(quaternion(pose), d_bar * offset.outer_product(n64))
             for i in ti.static(range(4)):
                 pose_bar[3 + i] = q_bar[i]
         if ti.static(MANIPULATOR_SHAPES[shape].grips):
