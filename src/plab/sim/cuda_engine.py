@@ -363,7 +363,9 @@ class CudaEngine(CudaPhases):
             for row in range(self.batch * self.materials):
                 self.take_material(row)
             for e in range(self.batch):
-                self.take_world(e)
+                for entry in range(self.world_bar.shape[1]):
+                    at = e * self.world_bar.shape[1] + entry
+                    self.world_bar[e, entry] += self.take_sum(self.world_sums, at)
         for q in range(self.pose_threads):
             self.block_count[0] = 0
             m = q // self.batch

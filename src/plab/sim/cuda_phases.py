@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from plab.sim.compiler import grid_memory_fence, ti
-from plab.sim.cuda_sums import gather_sums, look, variables
+from plab.sim.cuda_sums import look, variables
 from plab.sim.cuda_warp import (
     ALL_LANES,
     BLOCK_WARPS,
@@ -168,11 +168,19 @@ class CudaPhases(OrderPhases, PosePhases):
         w = spline(fx)
         dw = spline_slope(fx)
         node = e * self.nodes + self.linear(base)
-        velocity = self.node_address(self.velocity, node)
-        momentum = self.node_address(self.momentum_bar, node)
+        velocity = ti.u64(self.node_address(self.velocity, node))
+        momentum = ti.u64(self.node_address(self.momentum_bar, node))
+        axis = ti.i64(self.axis)
         # Moments of the momentum's adjoint, as in the gather, and the slope of both grids' part in it.
-        sums = ti.static(self.function("transfers", "gather_sums"))
-        m0, mx, my, mz, slope = gather_sums(sums, self.real, velocity, momentum, self.axis, w, dw, q, h)
+        weights = variables(self.real, [w[k][i] for k in range(3) for i in range(3)])
+        slopes = variables(self.real, [dw[k][i] for k in range(3) for i in range(3)])
+        momenta = variables(self.real, [q[k][i] for k in range(4) for i in range(4)])
+        adjoints = variables(self.real, [h[k][i] for k in range(4) for i in range(4)])
+        sums = variables(self.real, [0.0 for _ in range(12)])
+        slope = variables(self.real, [0.0 for _ in range(3)])
+        function = ti.static(self.function("transfers", "gather_sums"))
+        function(velocity, momentum, axis, *weights, *slopes, *momenta, *adjoints, *sums, *slope)
+        m0, mx, my, mz = sums[:3], sums[3:6], sums[6:9], sums[9:]
         c_bar = self.load(bar, target + AT_C, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
@@ -348,13 +356,6 @@ class CudaPhases(OrderPhases, PosePhases):
     def accumulate_world(self, grid_index, e, entry, value):
         """Add to an adjoint of an environment's friction or gravity."""
         self.add_up(self.world_sums, e * (WORLD + self.manipulators) + entry, ti.cast(value, ti.f64))
-
-    @ti.func
-    def take_world(self, e):
-        """Add the contributions of an environment step to the adjoints of friction and gravity."""
-        for entry in range(WORLD + self.manipulators):
-            at = e * (WORLD + self.manipulators) + entry
-            self.world_bar[e, entry] += self.take_sum(self.world_sums, at)
 
     # -- poses --------------------------------------------------------------------------------------
 

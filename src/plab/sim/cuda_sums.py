@@ -77,32 +77,6 @@ def variables(real: ti.template(), values: ti.template()):
     return [local_variable(ti.cast(value, real)) for value in values]
 
 
-@ti.func
-def gather_sums(
-    function: ti.template(),
-    real: ti.template(),
-    velocity,
-    momentum,
-    axis,
-    w: ti.template(),
-    dw: ti.template(),
-    q: ti.template(),
-    h: ti.template(),
-):
-    """Return sums over a particle's stencil for its adjoint, given the addresses of its base node in the
-    grids of velocities and of the momentum adjoint p: sums of w p and of w p times the node offset (0, 1,
-    2) along x, y and z (3 components each), and the sum of grad_f w (p . q + velocity . h) for affine
-    fields ``q`` and ``h`` (value at the base node, then increments along x, y, z)."""
-    v, p, n = ti.u64(velocity), ti.u64(momentum), ti.i64(axis)
-    weights = variables(real, [w[k][i] for k in range(3) for i in range(3)])
-    slopes = variables(real, [dw[k][i] for k in range(3) for i in range(3)])
-    momenta = variables(real, [q[k][i] for k in range(4) for i in range(4)])
-    adjoints = variables(real, [h[k][i] for k in range(4) for i in range(4)])
-    m, t = variables(real, [0.0 for _ in range(12)]), variables(real, [0.0 for _ in range(3)])
-    ti.static(function)(v, p, n, *weights, *slopes, *momenta, *adjoints, *m, *t)
-    return m[:3], m[3:6], m[6:9], m[9:], t
-
-
 class SumPhases(Storage):
     """Atomic sums; integer sums in a deterministic simulator.
 

@@ -52,9 +52,9 @@ NODE_STRIDE = 5
 
 
 @ti.func
-def packed(a, b):
-    low = ti.cast(ti.cast(ti.bit_cast(a, ti.i32), ti.u32), ti.i64)
-    return low | (ti.cast(ti.bit_cast(b, ti.i32), ti.i64) << 32)
+def joined(low, high):
+    """64-bit integer from two integers of 32 bits."""
+    return ti.cast(ti.cast(low, ti.u32), ti.i64) | (ti.cast(high, ti.i64) << 32)
 
 
 @ti.func
@@ -102,12 +102,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def node_slope(self, grid: ti.template(), node):
-        out = ti.cast(0.0, self.real)
-        if ti.static(self.real == ti.f32):
-            out = ti.bit_cast(ti.cast(grid[2 * node + 1] >> 32, ti.i32), ti.f32)
-        else:
-            out = grid[node][3]
-        return out
+        return self.node4(grid, node)[3]
 
     @ti.func
     def turns_of(self, w, threads, total):
@@ -176,7 +171,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 near = turn * 16 + lane // 2
                 node = e * self.nodes + self.linear_in_block(block, r - lane + near)
                 at = corner + near * NODE_STRIDE + 2 * (lane % 2)
-                grid[2 * node + lane % 2] = packed(shared[at], shared[at + 1])
+                low, high = ti.bit_cast(shared[at], ti.i32), ti.bit_cast(shared[at + 1], ti.i32)
+                grid[2 * node + lane % 2] = joined(low, high)
         else:
             for turn in ti.static(range(4)):
                 near = turn * 8 + lane // 4
@@ -192,8 +188,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         bits = ti.bit_cast(value, ti.i64)
         low = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), offset)
         high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
-        joined = (ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64)
-        return ti.bit_cast(joined, ti.f64)
+        return ti.bit_cast(joined(low, high), ti.f64)
 
     @ti.func
     def sum_of_warp(self, value):
@@ -213,7 +208,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
             bits = ti.bit_cast(value, ti.i64)
             low = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), step)
             high = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), step)
-            out = ti.bit_cast((ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64), ti.f64)
+            out = ti.bit_cast(joined(low, high), ti.f64)
         return out
 
     @ti.func
