@@ -120,10 +120,8 @@ class CameraSensor:
         """Fill an image by a kernel; return an array, or a CUDA tensor like ``like``."""
         shape = self.batch, self.height, self.width
         if on_device(like):
-            real = kind is np.float32
-            picture: Any = like.new_empty(
-                shape, dtype=getattr(sys.modules["torch"], "float32" if real else "int32")
-            )
+            dtype = getattr(sys.modules["torch"], kind.__name__)
+            picture: Any = like.new_empty(shape, dtype=dtype)
             fill_tensor(picture, lambda out: write(self._keys, *arguments, out.reshape(-1)))
         else:
             picture = np.empty(shape, kind)
