@@ -235,13 +235,6 @@ class CemConfig(SamplerConfig):
     smoothing: float = field(metadata=ranges.FRACTION)
     least_spread: float = field(metadata=ranges.FINITE)
 
-    @property
-    def fitted(self) -> int:
-        """Number of candidates that count."""
-        if self.elites > self.population:
-            return self.population // 2
-        return self.elites
-
 
 class Cem(Sampler):
     """Sampler with the mean and standard deviation of the elites at each point."""
@@ -255,7 +248,9 @@ class Cem(Sampler):
         return self.memory["mean"] + self.memory["std"] * self.noise(random)
 
     def learn(self, points: Tensor, cost: Tensor) -> None:
-        elites = points[cost.argsort(stable=True)[: self.method.fitted]]
+        wanted, population = self.method.elites, self.method.population
+        count = wanted if wanted <= population else population // 2
+        elites = points[cost.argsort(stable=True)[:count]]
         mean, std = elites.mean(0), elites.std(0).clamp(min=self.method.least_spread)
         self.memory["mean"] = torch.lerp(mean, self.memory["mean"], self.method.smoothing)
         self.memory["std"] = torch.lerp(std, self.memory["std"], self.method.smoothing)
@@ -295,15 +290,9 @@ class Mppi(Sampler):
         self.memory["mean"] = (weights[:, None, None] * points).sum(0)
 
 
-@dataclass
-class CmaesConfig(SamplerConfig):
-    """Covariance matrix adaptation."""
-
-
 class Cmaes(Sampler):
     """The library's search over the concatenated points of a curve, on the host."""
 
-    method: CmaesConfig
     _search: CMA
 
     def recentre(self, point: Tensor) -> None:
@@ -357,7 +346,7 @@ FAMILY = Family(
         "multistart": Rule(Multistart, MultistartConfig),
         "cem": Rule(Cem, CemConfig),
         "mppi": Rule(Mppi, MppiConfig),
-        "cmaes": Rule(Cmaes, CmaesConfig),
+        "cmaes": Rule(Cmaes, SamplerConfig),
         "stages": Rule(Stages, StagesConfig),
     },
     methods={
