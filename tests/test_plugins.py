@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from plab.config import ConfigError
-from plab.plugins import exported_module_path, load_object, search_in
+from plab.plugins import export_module_path, load_object, search_in
 from refusals import why
 
 
@@ -27,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             del sys.modules[name]
 
 
-def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path) -> None:
+def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path, monkeypatch) -> None:
     (folder / "zz_inside.py").write_text("FOUND = 1\n")
     (folder.parent / "zz_above.py").write_text("FOUND = 2\n")
     with pytest.raises(ConfigError, match="zz_inside"):
@@ -37,15 +37,15 @@ def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path) -> No
     assert [load_object(f"zz_{where}:FOUND", int) for where in ("inside", "above")] == [1, 2]
     # Behind everything else, and once.
     assert sys.path[-2:] == [str(folder), str(folder.parent)] and sys.path.count(str(folder)) == 1
-    before = os.environ.get("PYTHONPATH")
-    with exported_module_path():
-        command = [sys.executable, "-c", "import zz_above, plab; print(zz_above.FOUND)"]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout == "2\n" and os.environ.get("PYTHONPATH") == before
     # Environments are registered before the user's modules are imported.
     (folder / "zz_made.py").write_text("import gymnasium\nraise OSError(gymnasium.spec('plab/Rope-v2').id)")
     command = [sys.executable, "-m", "plab", "run", "--config-dir", str(folder), "method.family=zz_made:A"]
     assert "OSError: plab/Rope-v2" in subprocess.run(command, capture_output=True, text=True).stderr
+    monkeypatch.setenv("PYTHONPATH", "zz_before")
+    export_module_path()
+    assert os.environ["PYTHONPATH"].endswith(f"{os.pathsep}zz_before")
+    command = [sys.executable, "-c", "import zz_above, plab; print(zz_above.FOUND)"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "2\n"
 
 
 def test_what_is_wrong_is_one_line(folder: Path) -> None:

@@ -10,8 +10,7 @@ import os
 import sys
 import traceback
 from collections import UserDict
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -69,20 +68,12 @@ def search_in(config_dir: str | Path) -> None:
     sys.path += [path for path in (str(folder), str(folder.parent)) if path not in sys.path]
 
 
-@contextmanager
-def exported_module_path() -> Iterator[None]:
-    """Export the module path to processes started inside the ``with`` block."""
-    before = os.environ.get("PYTHONPATH")
+def export_module_path() -> None:
+    """Export the module path to processes started later by this process."""
     # Python's own folders are left out, because the other process may use another version.
     own = [path for path in sys.path if path and not path.startswith((sys.prefix, sys.base_prefix))]
-    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*own, *filter(None, [before])]))
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+    before = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*own, *filter(None, before)]))
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:

@@ -33,7 +33,7 @@ from plab.config.overrides import parse, swept
 from plab.config.selection import OBSERVATION_KEYS
 from plab.config.suite import choices
 from plab.errors import PlabError, print_error
-from plab.plugins import exported_module_path
+from plab.plugins import export_module_path
 from plab.problem import build_scenes
 from plab.results import ResultsError, RunFile, read, row_count
 from plab.results.run_file import PARTIAL_SUFFIX
@@ -280,9 +280,9 @@ def _submit_batches(
             task_function=partial(_job, batches),
             config=config,
         )
-        with exported_module_path():
-            # A job composes the configuration of its first run and then computes the whole batch.
-            returns = launcher.launch([jobs[str(batch[0].path)] for batch in batches], 0)
+        export_module_path()
+        # A job composes the configuration of its first run and then computes the whole batch.
+        returns = launcher.launch([jobs[str(batch[0].path)] for batch in batches], 0)
         yield from [one for job in returns for one in job.return_value]
     except Exception as error:
         # A job was killed, or the queue rejected the jobs; the result files have the progress.
