@@ -12,10 +12,10 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import asdict, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -78,24 +78,22 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
     if not cfgs and len({one.message for one in ended}) == 1:
         # An error common to all jobs.
         raise ConfigError(ended[0].message)
-    with ExitStack() as stack:
-        execute, processes = execute_batches, 1
-        if settings["inner"] is not None:
-            execute = partial(_submit_batches, master, settings["inner"], by_path)
-            # As in joblib, -1 means one per core.
-            wanted = settings["inner"].get("n_jobs", 1)
-            processes = wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
-        else:
-            for cfg in cfgs:
-                require_runnable(cfg)
-            if settings["per_gpu"]:
-                execute, processes = stack.enter_context(_gpu_workers(settings["per_gpu"], len(cfgs)))
-        try:
-            ended.extend(
-                run_batches(cfgs, execute, settings["batch_size"], processes, settings["per_gpu"] or 1)
-            )
-        finally:
-            code = report(ended)
+    execute, processes = execute_batches, 1
+    if settings["inner"] is not None:
+        execute = partial(_submit_batches, master, settings["inner"], by_path)
+        # As in joblib, -1 means one per core.
+        wanted = settings["inner"].get("n_jobs", 1)
+        processes = wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
+    else:
+        for cfg in cfgs:
+            require_runnable(cfg)
+        if settings["per_gpu"]:
+            places = _gpu_places(settings["per_gpu"])
+            execute, processes = partial(_execute_on_gpus, places), len(places)
+    try:
+        ended.extend(run_batches(cfgs, execute, settings["batch_size"], processes, settings["per_gpu"] or 1))
+    finally:
+        code = report(ended)
     return code
 
 
@@ -132,15 +130,12 @@ def jobs_of(
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
     """Compose and check the runs of a sweep, given prepared overrides for each; return a configuration or an
     error for each. Shared parts are checked once."""
-    finished: dict[tuple[str, ...], Config | str] = {}
+    checked = cache(partial(_checked, config_dir=config_dir))
     entries: list[Config | Outcome] = []
     for job in jobs:
         # No other value of a configuration depends on the seed.
         seeds = [word for word in job if re.fullmatch(r"seed=\d{1,9}", word)]
-        words = tuple(word for word in job if word not in seeds)
-        if words not in finished:
-            finished[words] = _checked(words, config_dir)
-        made = finished[words]
+        made = checked(tuple(word for word in job if word not in seeds))
         if isinstance(made, str):
             entries.append(Outcome(" ".join(job), "", "refused", message=made))
         else:
@@ -327,53 +322,43 @@ def _finished_before(cfg: Config) -> Outcome | None:
 # ------------------------------------------------------------------------------------------------------- GPUs
 
 
-@contextmanager
-def _gpu_workers(per_gpu: int, most: int) -> Iterator[tuple[Executor, int]]:
-    """Start ``per_gpu`` processes on each GPU, at most ``most`` in total, for the duration of the ``with``
-    block; yield a function that executes batches with them, and their number. Raise ConfigError if there
-    is no GPU."""
+def _gpu_places(per_gpu: int) -> list[str]:
+    """Return the GPU of each worker process, ``per_gpu`` on each; raise ConfigError if there is no GPU."""
     named = os.environ.get(VISIBLE)
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):
         raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; omit it")
-    # Processes are distributed evenly over GPUs.
-    places = names * per_gpu
-    pools = [_pool(name) for name in places[:most]]
-    try:
-        yield partial(_dispatch, pools, places), len(places)
-    except BaseException:
-        # After Ctrl-C, busy processes write a checkpoint.
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    finally:
-        for pool in pools:
-            pool.shutdown(cancel_futures=True)
+    # The first processes are distributed evenly over GPUs.
+    return names * per_gpu
 
 
-def _dispatch(
-    pools: list[ProcessPoolExecutor],
-    places: Sequence[str],
-    batches: list[list[Config]],
-    progress: Callable[[], str],
+def _execute_on_gpus(
+    places: Sequence[str], batches: list[list[Config]], progress: Callable[[], str]
 ) -> Iterator[Outcome]:
-    """Assign batches to free processes, and yield the outcomes."""
-    waiting, free = list(batches), list(range(len(pools)))
-    running: dict[Future[list[Outcome]], tuple[int, list[Config]]] = {}
-    while waiting or running:
-        while waiting and free:
-            number, batch = free.pop(0), waiting.pop(0)
-            note = f"GPU {places[number]} {progress()}"
-            running[pools[number].submit(_carry_out, batch, note)] = number, batch
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            number, batch = running.pop(future)
-            free.append(number)
-            try:
-                yield from future.result()
-            except BrokenProcessPool:
-                # After a kill, the result files have the progress.
-                pools[number] = _pool(places[number])
-                yield from map(stored_outcome, batch)
+    """Execute batches in a process per place, each in the next free one, and yield the outcomes."""
+    with ExitStack() as pools:
+        waiting = list(batches)
+        free = [(gpu, pools.enter_context(_pool(gpu))) for gpu in places[: len(batches)]]
+        running: dict[Future[list[Outcome]], tuple[str, ProcessPoolExecutor, list[Config]]] = {}
+        try:
+            while waiting or running:
+                while waiting and free:
+                    (gpu, pool), batch = free.pop(0), waiting.pop(0)
+                    running[pool.submit(_carry_out, batch, f"GPU {gpu} {progress()}")] = gpu, pool, batch
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    gpu, pool, batch = running.pop(future)
+                    try:
+                        yield from future.result()
+                    except BrokenProcessPool:
+                        # After a kill, the result files have the progress.
+                        pool = pools.enter_context(_pool(gpu))
+                        yield from map(stored_outcome, batch)
+                    free.append((gpu, pool))
+        except BaseException:
+            # After Ctrl-C, busy processes write a checkpoint.
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
 
 
 # Code below runs in the worker processes.
