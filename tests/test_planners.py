@@ -55,8 +55,8 @@ def judged(request: Request, broken: Sequence[int] = ()) -> Answer:
     loss, final = away.square().sum((1, 2)), away[:, -1].square().sum(1)
     lost = torch.zeros(len(loss), dtype=torch.bool)
     lost[list(broken)] = True
-    measures = {"loss": loss, "score": 1.0 / (1.0 + final)}
-    return Answer(measures, final, 2.0 * away if request.gradient else None, lost)
+    measures = {"loss": loss, "final_loss": final, "score": 1.0 / (1.0 + final)}
+    return Answer(measures, 2.0 * away if request.gradient else None, lost)
 
 
 def iterate(search, iteration: int, broken: Sequence[int] = ()) -> tuple[list[Request], tuple]:
@@ -182,7 +182,7 @@ def test_stages_begin_from_the_best_of_the_stage_before() -> None:
     (last,), first = shown[1][0], iterate(stages, 2)[0][0]
     best = max((one for _, one in shown), key=lambda one: one[1]["score"])
     # That which scored best of all, the last candidates by their rank, and two drawn afresh.
-    order = judged(last).final_loss.argsort()
+    order = judged(last).measures["final_loss"].argsort()
     assert torch.equal(first.actions[:3], torch.stack([best[0], *last.actions[order[:2]]]))
     torch.testing.assert_close(first.actions[3:], 0.3 * uniform(random(2), 2))
     # A search takes over the better half of what it has room for.
@@ -195,14 +195,15 @@ def test_a_search_in_soft_contact_shows_the_better_half_in_the_hard_model() -> N
     search = make_planner(rule("cem", "elites=2", "contact=soft", "softness=300", "objective=final"), START)
     (soft, hard), best = iterate(search, 0)
     assert (soft.softness, hard.softness, soft.gradient, hard.gradient) == (300, None, "", "")
-    order = judged(soft).final_loss.argsort()
+    order = judged(soft).measures["final_loss"].argsort()
     assert torch.equal(hard.actions, soft.actions[order[:2]]) and torch.equal(best[0], hard.actions[0])
 
 
 def test_costs_and_curves() -> None:
-    measures = {"loss": torch.tensor([3.0, 2.0, 1.0, 0.0]), "score": torch.tensor([0.5, 0.0, 0.0, 0.9])}
+    table = [[3.0, 2.0, 1.0, 0.0], [1.0, 4.0, 2.0, 0.0], [0.5, 0.0, 0.0, 0.9]]
+    measures = dict(zip(("loss", "final_loss", "score"), torch.tensor(table), strict=True))
     broken = torch.tensor([False, False, False, True])
-    answer = Answer(measures, torch.tensor([1.0, 4.0, 2.0, 0.0]), None, broken)
+    answer = Answer(measures, None, broken)
     for objective, order in (("loss", [2, 1, 0, 3]), ("final", [0, 2, 1, 3]), ("score", [0, 2, 1, 3])):
         assert answer.cost(objective).argsort().tolist() == order
     knots = torch.tensor([[[0.0], [1.0], [-3.0]]], dtype=torch.float64)
@@ -342,7 +343,7 @@ def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypa
 
     def evaluate_actions(self, actions, *, gradient):
         trials = intact(self, actions, gradient=gradient)
-        for values in (*trials.measures.values(), trials.final_loss, *[trials.gradient] * gradient):
+        for values in (*trials.measures.values(), *[trials.gradient] * gradient):
             values[which] = np.nan
         return replace(trials, failures=dict.fromkeys(which, "environment step 1: gone"))
 

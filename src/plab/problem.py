@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,6 @@ from plab.objective import (
     batch_scores,
     rewards,
     score_scale,
-    scores,
     scores_from_iou,
     soft_iou,
     spread_mass,
@@ -79,14 +78,12 @@ class BatchMeasures:
 
     Attributes:
         measures: Measures of the episodes, shape [batch] each: ``loss`` and its terms, ``reward``, ``iou``
-            and ``score``, as in the columns of results.
-        final_loss: Weighted loss of the last step, shape [batch].
+            and ``score``, as in the columns of results, and ``final_loss``, the loss of the last step.
         gradient: Gradient of ``loss``, shape [batch, T, A], or None.
         failures: Diverged environments, with time and reason; their values are meaningless.
     """
 
     measures: dict[str, Any]
-    final_loss: Any
     gradient: Any
     failures: dict[int, str]
 
@@ -158,7 +155,8 @@ class Problem:
         weights: Their weights, shape [term].
         labels: Labels with units, by column of results.
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
-        initial_scores: Scores of the initial states.
+        initial_iou: Soft IoUs of the initial states with the targets, shape [batch].
+        best_iou: Soft IoUs of the targets with themselves, shape [batch].
     """
 
     def __init__(self, cfgs: Sequence[Config], simulator: Simulator | None = None) -> None:
@@ -211,9 +209,9 @@ class Problem:
         kinds = [str(k) for k in range(len(self.scenes))] if kinds is None else kinds
         pairs = zip(self._initial_mass, self.target_mass, strict=True)
         first = dict(zip(kinds, pairs, strict=True))
-        judged = {kind: scores(mass, mass, target) for kind, (mass, target) in first.items()}
-        self.initial_scores = [judged[kind] for kind in kinds]
-        self._rescale()
+        ious = {k: (soft_iou(mass, goal), soft_iou(goal, goal)) for k, (mass, goal) in first.items()}
+        self.initial_iou, self.best_iou = np.array([ious[kind] for kind in kinds]).T
+        self._scale = Constants(score_scale(self.initial_iou, self.best_iou))
 
     def foreign_targets(self) -> dict[int, tuple[np.ndarray, None]]:
         """Return the targets that the caller has set in the simulator since :meth:`refresh`, by environment,
@@ -251,15 +249,12 @@ class Problem:
             simulator.set_target(np.stack(masses), np.stack(distances))
             self.target_mass, self._distances = simulator.target_mass, distances
             for e in targets:
-                best = soft_iou(self.target_mass[e], self.target_mass[e])
-                self.initial_scores[e] = replace(self.initial_scores[e], iou_target_self=best)
+                self.best_iou[e] = soft_iou(self.target_mass[e], self.target_mass[e])
 
     def note_starts(self, environments: Sequence[int], iou: np.ndarray) -> None:
         """Set the soft IoUs of the initial states for scores, shape [batch]."""
-        for e in environments:
-            start = float(iou[e])
-            self.initial_scores[e] = scores_from_iou(start, start, self.initial_scores[e].iou_target_self)
-        self._rescale()
+        self.initial_iou[environments] = iou[environments]
+        self._scale = Constants(score_scale(self.initial_iou, self.best_iou))
 
     def distances(self) -> list[np.ndarray]:
         """Return the distances to the targets, shape [n, n, n] each."""
@@ -278,10 +273,6 @@ class Problem:
                 self._initial_mass[e] = spread
             self._stale_mass = set()
         return self._initial_mass
-
-    def _rescale(self) -> None:
-        pairs = ((one.iou_initial, one.iou_target_self) for one in self.initial_scores)
-        self._scale = Constants(score_scale(*zip(*pairs, strict=True)))
 
     def loss_of(self, terms: Any) -> Any:
         """Return the weighted sum of terms, shape [..., term], as an array or tensor of shape [...]."""
@@ -316,7 +307,7 @@ class Problem:
         total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
-        return BatchMeasures(measures, loss[:, -1], result.gradient, result.failures)
+        return BatchMeasures(measures | {"final_loss": loss[:, -1]}, result.gradient, result.failures)
 
     def iou_gradient(self, actions: torch.Tensor) -> tuple[torch.Tensor, dict[int, str]]:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
@@ -395,8 +386,7 @@ class Problem:
         return [self._score(e, soft_iou(own, self.target_mass[e])) for e, own in enumerate(mass)]
 
     def _score(self, e: int, iou: float) -> Scores:
-        first = self.initial_scores[e]
-        return scores_from_iou(first.iou_initial, iou, first.iou_target_self)
+        return scores_from_iou(float(self.initial_iou[e]), iou, float(self.best_iou[e]))
 
 
 def _warn_of_thin(scenes: Sequence[Scene]) -> None:

@@ -522,7 +522,7 @@ class EpisodeBatch:
         for e in self.failures:
             # Diverged environments are frozen in an arbitrary finite state.
             simulation.x[e], simulation.v[e], simulation.C[e], simulation.F[e] = 0.5, 0.0, 0.0, np.eye(3)
-        starts = self._initial_loss.like(None), [one.iou_initial for one in self.problem.initial_scores]
+        starts = self._initial_loss.like(None), self.problem.initial_iou
         episodes = {name: copy.deepcopy(getattr(self, name)) for name in _EPISODES}
         stages = self._stages.saved() if self._stages else ()
         values = tuple(self.randomizer.values)

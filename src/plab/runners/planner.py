@@ -76,24 +76,22 @@ class Answer:
     """Evaluation of candidates.
 
     Attributes:
-        measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each; none with the
-            gradient of ``score``.
-        final_loss: Loss of the last step, shape [P]; 0 with the gradient of ``score``.
+        measures: Measures of :class:`plab.problem.BatchMeasures`, shape [P] each; none with the gradient of
+            ``score``.
         gradient: Requested gradient, shape [P, T, A], 0 for diverged candidates; None if not requested.
         broken: Diverged candidates, shape [P], bool; their values are meaningless.
     """
 
     measures: dict[str, Tensor]
-    final_loss: Tensor
     gradient: Tensor | None
     broken: Tensor
 
     def cost(self, objective: str) -> Tensor:
         """Return the costs that rank candidates, shape [P], infinite for diverged ones."""
-        loss, score = self.measures["loss"], self.measures["score"]
+        loss, final, score = (self.measures[name] for name in ("loss", "final_loss", "score"))
         # Candidates with score 0 are ranked by their loss, mapped to values between 0 and 1.
         by_score = torch.where(score > 0, -score, loss / (1.0 + loss))
-        cost = {"loss": loss, "final": self.final_loss, "score": by_score}[objective]
+        cost = {"loss": loss, "final": final, "score": by_score}[objective]
         return torch.where(self.broken, torch.inf, cost)
 
 
@@ -362,15 +360,14 @@ class PlannerRunner(Runner):
         for part in tried.split(width):
             flat = part.flatten(0, 1)
             broken = torch.zeros(part.shape[:2].numel(), dtype=torch.bool, device=self._device)
-            given: dict[str, Any] = {"broken": broken, "final": torch.zeros_like(broken, dtype=torch.float64)}
+            given: dict[str, Any] = {"broken": broken}
             if first.gradient == "score":
                 slope, failures = self.problem.iou_gradient(flat)
-                given |= {"gradient": -slope}
+                given["gradient"] = -slope
             else:
                 trials = self.problem.evaluate_actions(flat, gradient=first.gradient == "loss")
                 failures = trials.failures
-                given |= trials.measures | {"final": trials.final_loss}
-                given |= {"gradient": trials.gradient} if first.gradient else {}
+                given |= trials.measures | ({"gradient": trials.gradient} if first.gradient else {})
             broken[list(failures)] = True
             reasons |= {e % runs: text for e, text in failures.items()}
             for name, values in given.items():
@@ -379,10 +376,10 @@ class PlannerRunner(Runner):
         answers = {}
         for track in requests:
             own = {name: values[:, places[track]] for name, values in whole.items()}
-            broken, final, gradient = own.pop("broken"), own.pop("final"), own.pop("gradient", None)
+            broken, gradient = own.pop("broken"), own.pop("gradient", None)
             if gradient is not None:
                 gradient = gradient.masked_fill(broken[:, None, None], 0.0)
-            answers[track] = Answer(own, final, gradient, broken)
+            answers[track] = Answer(own, gradient, broken)
             if bool(broken.all()):
                 track.fail(f"all {count} candidates diverged; {reasons[places[track]]}")
         return answers
