@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import timedelta
@@ -74,21 +74,18 @@ def show_line(text: str) -> None:
 
 
 def _plain(title: str, start: int, total: int, every: int) -> Report:
-    begin: tuple[float, int] | None = None
-    last = start
+    # Estimates the remaining time, without the first step, which includes compilation.
+    bars = Progress(disable=True, speed_estimate_period=math.inf)
+    bars.add_task(title, total=total, completed=start)
+    (task,), last = bars.tasks, start
 
     def report(done: int, text: str) -> None:
-        nonlocal begin, last
-        now = time.monotonic()
-        left = "started"
-        if begin is None or done == begin[1]:
-            # The first step includes compilation and is excluded from the speed.
-            begin = begin or (now, done)
-        else:
-            seconds = (now - begin[0]) / (done - begin[1]) * (total - done)
-            left = f"{timedelta(seconds=round(seconds))} left"
+        nonlocal last
+        bars.update(task.id, completed=done)
         # A step may be a batch of episodes and skip multiples of the interval.
         if last == start or done // every > last // every or done == total:
+            seconds = task.time_remaining
+            left = "started" if seconds is None else f"{timedelta(seconds=seconds)} left"
             print(f"{title} {done}/{total}, {left}, {text}", flush=True)
         last = done
 
