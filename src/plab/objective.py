@@ -147,25 +147,22 @@ def chamfer_distance(a: ArrayLike, b: ArrayLike) -> float:
     return float((a * away[0]).sum() / a.sum() + (b * away[1]).sum() / b.sum())
 
 
-def earth_movers_distance(a: ArrayLike, b: ArrayLike, points: int = TRANSPORT_PORTIONS) -> float:
+def earth_movers_distance(a: ArrayLike, b: ArrayLike) -> float:
     """Return the earth mover's distance of two mass tensors, shape [n, n, n]: the minimum mean transport
     distance [domain units].
 
-    Both tensors are divided into ``points`` portions of equal mass, of neighbouring nodes along a
-    space-filling curve, which are matched optimally. For shapes far apart the result is exact up to the size
-    of a portion.
+    Both tensors are divided into portions of equal mass, of neighbouring nodes along a space-filling curve,
+    which are matched optimally. For shapes far apart the result is exact up to the size of a portion.
     """
     # Imported here, because SciPy would slow down every `--help`.
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    distances = cdist(*(mass_portions(np.asarray(mass, np.float64), points) for mass in (a, b)))
+    distances = cdist(mass_portions(a, TRANSPORT_PORTIONS), mass_portions(b, TRANSPORT_PORTIONS))
     return float(distances[linear_sum_assignment(distances)].mean())
 
 
-def earth_movers_distances(
-    a: Iterable[ArrayLike], b: Iterable[ArrayLike], like: Any, points: int = TRANSPORT_PORTIONS
-) -> Any:
+def earth_movers_distances(a: Iterable[ArrayLike], b: Iterable[ArrayLike], like: Any) -> Any:
     """Return approximate earth mover's distances [domain units] of pairs of mass tensors, on a device.
 
     Sinkhorn iterations in the log domain match the portions of :func:`earth_movers_distance`, with an
@@ -179,16 +176,13 @@ def earth_movers_distances(
         a: First mass tensors, shape [pair, n, n, n].
         b: Second mass tensors, shape [pair, n, n, n].
         like: PyTorch tensor whose device computes.
-        points: Number of portions.
 
     Returns:
         Tensor of shape [pair], float64.
     """
-    like, log_count = like.double(), np.log(points)
-    x, y = (
-        like.new_tensor(np.stack([mass_portions(np.asarray(mass, np.float64), points) for mass in masses]))
-        for masses in (a, b)
-    )
+    like, log_count = like.double(), np.log(TRANSPORT_PORTIONS)
+    portions = (np.stack([mass_portions(mass, TRANSPORT_PORTIONS) for mass in masses]) for masses in (a, b))
+    x, y = map(like.new_tensor, portions)
     out = like.new_empty(len(x))
     # In parts, so that the cost matrices fit into memory.
     for first in range(0, len(x), 4):
@@ -204,8 +198,9 @@ def earth_movers_distances(
     return out
 
 
-def mass_portions(mass: np.ndarray, count: int) -> np.ndarray:
+def mass_portions(mass: ArrayLike, count: int) -> np.ndarray:
     """Return the centroids of portions of equal mass, shape [count, 3]."""
+    mass = np.asarray(mass, np.float64)
     node = np.argwhere(mass > 0.0)
     # Morton order: interleaved bits of the three indices.
     bits = (node[:, :, None] >> np.arange(mass.shape[0].bit_length())) & 1

@@ -169,9 +169,8 @@ class ContactStarts:
         return place - np.asarray(tool.position)
 
     def _actions(self, tracks: Sequence[ActionTrack]) -> np.ndarray:
-        if not tracks:
-            return np.zeros((self._scene.horizon, 0))
-        return np.concatenate([track.first(self._scene.horizon) for track in tracks], axis=1)
+        steps = self._scene.horizon
+        return np.concatenate([np.zeros((steps, 0)), *(track.first(steps) for track in tracks)], axis=1)
 
 
 def _middle_ways(ways: np.ndarray, body: np.ndarray) -> np.ndarray:

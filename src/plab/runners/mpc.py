@@ -109,15 +109,15 @@ class MpcRunner(PlannerRunner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Begin the episode, or repeat the steps stored in the file."""
-        self._executed = np.zeros((0, self.problem.scenes[0].action_dim))
-        self._found: Tensor | None = None
+        action_dim = self.problem.scenes[0].action_dim
+        self._executed, found = np.zeros((0, action_dim)), np.zeros((0, self.method.window, action_dim))
         self._terms: list[np.ndarray] = []
         self._first_loss = float(self.problem.loss_of(self.problem.simulator.measure().terms)[0])
         self.problem.simulator.set_initial_state(self._beginning)
         if state is not None:
             self._execute(np.array(state["executed"]))
-            if "found" in state:
-                self._found = torch.as_tensor(np.array(state["found"]), device=self._device)
+            found = np.array(state["found"])
+        self._found = torch.as_tensor(found, device=self._device)
 
     def iterations(self, track: Track) -> int:
         """Return the number of plans per episode."""
@@ -139,10 +139,9 @@ class MpcRunner(PlannerRunner):
         else:
             # Contact starts only apply at the beginning of the episode.
             planner = make_planner(replace(own, contact_starts=0.0) if taken else own, start)
-        found = None if self._found is None else self._found[:, :ahead]
         for number in range(own.iterations):
             random = self.random(track.cfg.seed, track.iteration, number)
-            _, steps = self.drive({track: planner.plan(random, found if number == 0 else None)})
+            _, steps = self.drive({track: planner.plan(random, self._found[:, :ahead])})
             spent += steps[track]
             if not track.open:
                 return

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from plab.config import ConfigError, MethodConfig, ranges
+from plab.config import ConfigError, MethodConfig, build_scene, ranges
 from plab.config.families import family
 from plab.plugins import torch
 from plab.runners.policy import torch_settings
@@ -269,13 +269,12 @@ class PlannerRunner(Runner):
     def _simulate(self, tracks: Sequence[Track], width: int | None = None) -> None:
         """Build the problem of some runs, with at most ``width`` environments each, by default the smallest
         population; environment e belongs to run e modulo the number of runs."""
-        from plab.problem import build_scenes
         from plab.sim.memory import batch_limit
 
         # Releases the memory of the simulator in use.
         self.__dict__.pop("problem", None)
         cfgs = [track.cfg for track in tracks]
-        scene, sim = build_scenes(cfgs[:1])[0], cfgs[0].sim
+        scene, sim = build_scene(cfgs[0]), cfgs[0].sim
         wanted = width or min(_smallest_population(cfg.method) for cfg in cfgs)
         room = max(1, batch_limit(scene, sim.precision, sim.device, sim.memory_mb) // len(cfgs))
         parts = -(-wanted // room)
