@@ -34,8 +34,6 @@ from plab.runners.trajectory import TrajectoryConfig
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from plab.sim import State
-
 
 @dataclass
 class MpcConfig(MethodConfig):
@@ -102,18 +100,12 @@ class MpcRunner(PlannerRunner):
     actions.
     """
 
-    def build(self) -> None:
-        """Build the problem, with an environment per candidate."""
-        super().build()
-        self._beginning = self._current_state()
-
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Begin the episode, or repeat the steps stored in the file."""
         action_dim = self.problem.scenes[0].action_dim
         self._executed, found = np.zeros((0, action_dim)), np.zeros((0, self.method.window, action_dim))
         self._terms: list[np.ndarray] = []
         self._first_loss = float(self.problem.loss_of(self.problem.simulator.measure().terms)[0])
-        self.problem.simulator.set_initial_state(self._beginning)
         if state is not None:
             self._execute(np.array(state["executed"]))
             found = np.array(state["found"])
@@ -167,9 +159,9 @@ class MpcRunner(PlannerRunner):
         yield track, step
 
     def close(self) -> None:
-        """Return to the initial state for the evaluation."""
-        if hasattr(self, "_beginning"):
-            self.problem.simulator.set_initial_state(self._beginning)
+        """Restore the scene's initial state for the evaluation."""
+        if hasattr(self, "problem"):
+            self.problem.simulator.set_scenes(self.problem.scenes)
 
     def _execute(self, actions: np.ndarray) -> None:
         """Execute actions, shape [k, A], in the hard contact model; plan next from the resulting state."""
@@ -178,13 +170,11 @@ class MpcRunner(PlannerRunner):
         done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)
         self._terms += list(done.step_terms[0])
         self._executed = np.concatenate([self._executed, actions])
-        self.problem.simulator.set_initial_state(self._current_state())
-
-    def _current_state(self) -> State:
-        """Return the state of the first environment, repeated for all environments."""
-        state = self.problem.simulator.state()
+        # The state of the first environment, for all environments.
+        state = simulator.state()
         arrays = {name: own for name, own in vars(state).items() if own is not None}
-        return replace(state, **{name: np.repeat(own[:1], len(own), axis=0) for name, own in arrays.items()})
+        first = {name: np.repeat(own[:1], len(own), axis=0) for name, own in arrays.items()}
+        simulator.set_initial_state(replace(state, **first))
 
 
 FAMILY = Family(
