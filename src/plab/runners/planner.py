@@ -188,10 +188,9 @@ class Planner(ABC):
         self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
 
 
-def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
+def make_planner(method: Any, start: CandidateStart) -> Any:
     """Return the planner for a ``method`` section: a single planner or stages."""
-    rule = family(method.family).rules[getattr(method, "algorithm")]  # noqa: B009
-    return rule.what(method, start)
+    return family(method.family).rules[method.algorithm].what(method, start)
 
 
 @dataclass

@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 
 Kept = TypeVar("Kept")
 
-COLUMNS = ("loss", "reward", "iou", "score")
-"""Result columns common to all methods: measures of an episode in addition to the loss terms."""
-
 FINAL_STATE_COLUMNS = ("iou", "score")
 """Columns that refer to the last state; the others are sums over the steps."""
 
@@ -510,8 +507,7 @@ def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
 
 def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
     """Return the columns of an episode's measures, given the loss terms."""
-    first, *rest = COLUMNS
-    return (first, *(f"loss_{name}" for name in term_names), *rest)
+    return ("loss", *(f"loss_{name}" for name in term_names), "reward", *FINAL_STATE_COLUMNS)
 
 
 def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:

@@ -130,7 +130,17 @@ def jobs_of(
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
     """Compose and check the runs of a sweep, given prepared overrides for each; return a configuration or an
     error for each. Shared parts are checked once."""
-    checked = cache(partial(_checked, config_dir=config_dir))
+
+    @cache
+    def checked(words: tuple[str, ...]) -> Config | str:
+        """Return a configuration, or the error in the configuration, its scene or its target."""
+        try:
+            cfg = finish(compose(words, config_dir), words, alone=False)
+            check_sources(cfg)
+        except PlabError as error:
+            return str(error)
+        return cfg
+
     entries: list[Config | Outcome] = []
     for job in jobs:
         # No other value of a configuration depends on the seed.
@@ -141,16 +151,6 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
         else:
             entries.append(replace(made, seed=int(seeds[-1].partition("=")[2])) if seeds else made)
     return entries
-
-
-def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
-    """Return a configuration, or the error in the configuration, its scene or its target."""
-    try:
-        cfg = finish(compose(words, config_dir), words, alone=False)
-        check_sources(cfg)
-    except PlabError as error:
-        return str(error)
-    return cfg
 
 
 # ---------------------------------------------------------------------------------------------------- batches
