@@ -25,7 +25,6 @@ from plab.config.families import Appearance, Family
 from plab.runners.runner import Runner, Step, Track, shared_problem
 
 if TYPE_CHECKING:
-    from plab.problem import Episodes
     from plab.scenes import Camera, Scene
 
 PARAMETERS = (
@@ -183,10 +182,6 @@ class IdentifyRunner(Runner):
         """Restore the configuration's scene."""
         if hasattr(self, "problem"):
             self.problem.simulator.set_scenes(self.problem.scenes)
-
-    def judge(self, actions: np.ndarray) -> Episodes:
-        """Run the actions in the configuration's scene."""
-        return super().judge(np.concatenate([actions] * self.problem.simulator.batch))
 
     def summary_line(self, means: Mapping[str, float], tracks: Any) -> str:
         """Return the misfit, and the parameters with their standard deviations."""

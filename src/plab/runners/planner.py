@@ -330,10 +330,10 @@ class PlannerRunner(Runner):
         return shown, spent
 
     def judge(self, actions: np.ndarray) -> Episodes:
-        """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
+        """Simulate the runs' actions, shape [run, T, A], in the hard contact model."""
         if len(self._simulated) < len(self.tracks):
             self._simulate(self.tracks, 1)
-        return super().judge(np.concatenate([actions] * self._width))
+        return super().judge(actions)
 
     def random(self, *key: int) -> torch.Generator:
         """Return the random generator of an iteration, reproducible when resuming."""

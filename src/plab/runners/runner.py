@@ -309,9 +309,11 @@ class Runner:
         """Write additional files of a run, before the final evaluation."""
 
     def judge(self, actions: np.ndarray) -> Episodes:
-        """Simulate actions, shape [batch, T, A], in the hard contact model."""
-        self.problem.simulator.set_contact("hard")
-        return self.problem.rollout(actions, gradient=False, strict=False)
+        """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
+        simulator = self.problem.simulator
+        simulator.set_contact("hard")
+        repeated = np.concatenate([actions] * (simulator.batch // len(actions)))
+        return self.problem.rollout(repeated, gradient=False, strict=False)
 
     def context(self) -> AbstractContextManager[Any]:
         """Return a context for the whole batch, such as thread settings of a library."""
