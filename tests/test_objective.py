@@ -17,7 +17,6 @@ from plab.objective import (
     earth_movers_distance,
     earth_movers_distances,
     mass_change,
-    rewards,
     score_scale,
     scores,
     scores_from_iou,
@@ -140,17 +139,14 @@ def test_target_observation():
     assert not target_observation(start, start).any()
 
 
-def test_total_loss_and_rewards(rng):
+def test_total_loss(rng):
     weights = np.array([10.0, 5.0, 2.0])
-    initial, steps = rng.random((2, 3)), rng.random((2, 6, 3))
-    loss, reward = total_loss(steps, weights), rewards(initial, steps, weights)
-    assert loss.shape == reward.shape == (2, 6)
+    steps = rng.random((2, 6, 3))
+    loss = total_loss(steps, weights)
+    assert loss.shape == (2, 6)
     for b, t in np.ndindex(2, 6):
         d, s, c = steps[b, t]
-        d0, s0, c0 = initial[b]
         assert loss[b, t] == pytest.approx(10 * d + 5 * s + 2 * c)
-        assert reward[b, t] == pytest.approx(10 * (d0 - d) + 5 * (s0 - s) + 2 * (c0 - c))
-    assert rewards(initial[0], steps[0], weights).shape == (6,)
 
 
 @pytest.mark.parametrize("x", [[1.0 - 1.0 / N, 0.5, 0.5], [0.5, -1.0 / N, 0.5]])

@@ -1,4 +1,4 @@
-"""Mass tensors, distances to a target, losses, rewards, soft IoU and scores.
+"""Mass tensors, distances to a target, losses, soft IoU and scores.
 
 Plain NumPy in float64, for the final evaluation and the tests; the simulator computes the same loss terms
 with gradients.
@@ -106,7 +106,8 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     outside = ~(mass > threshold)
     if outside.all():
         raise ArgumentError(
-            f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}"
+            f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}; raise "
+            "sim.particles_scale or lower sim.grid_size"
         )
     return distance_transform_edt(outside) / mass.shape[0]
 
@@ -289,12 +290,6 @@ def total_loss(terms: Any, weights: Any) -> Any:
     shape [term]; arrays or tensors."""
     # Not a matrix product, whose rounding depends on the number of losses.
     return (terms * weights).sum(-1)
-
-
-def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
-    """Return the reward of each step, shape [..., T]: the loss of the initial state minus the loss after the
-    step, given terms of shape [..., term] and [..., T, term]; arrays or tensors."""
-    return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
 
 
 # ------------------------------------------------------------------------------------------ terms of the loss
