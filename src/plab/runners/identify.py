@@ -56,7 +56,7 @@ class IdentifyConfig(MethodConfig):
     """
 
     dataset: str
-    observation: str
+    observation: str = field(metadata=ranges.within(ranges.one_of, ("particles", "depth")))
     episode: int = field(metadata=ranges.NOT_NEGATIVE)
     parameters: list[str]
     iterations: int = field(metadata=ranges.COUNT)
@@ -65,7 +65,6 @@ class IdentifyConfig(MethodConfig):
 
     def check(self, path: str) -> None:
         super().check(path)
-        ranges.one_of(f"{path}.observation", self.observation, ("particles", "depth"))
         if not self.parameters or len(set(self.parameters)) < len(self.parameters):
             raise ConfigError(f"{path}.parameters must name each parameter once (got {self.parameters})")
         for name in self.parameters:

@@ -115,9 +115,6 @@ class MpcRunner(PlannerRunner):
         """Return the number of plans per episode."""
         return math.ceil(track.cfg.sim.horizon / self.method.execute)
 
-    def has_more(self, track: Track) -> bool:
-        return track.iteration < self.iterations(track)
-
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
         method, (track,) = self.method, self.tracks

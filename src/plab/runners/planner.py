@@ -205,6 +205,11 @@ class StagesConfig(MethodConfig):
     algorithm: str
     stages: dict[str, Any]
 
+    @property
+    def population(self) -> int:
+        """Smallest number of candidates evaluated at once."""
+        return min(stage.population for stage in self.stages.values())
+
     def check(self, path: str) -> None:
         super().check(path)
         if not self.stages:
@@ -274,7 +279,8 @@ class PlannerRunner(Runner):
         self.__dict__.pop("problem", None)
         cfgs = [track.cfg for track in tracks]
         scene, sim = build_scene(cfgs[0]), cfgs[0].sim
-        wanted = width or min(_smallest_population(cfg.method) for cfg in cfgs)
+        methods: list[Any] = [cfg.method for cfg in cfgs]
+        wanted = width or min(method.population for method in methods)
         room = max(1, batch_limit(scene, sim.precision, sim.device, sim.memory_mb) // len(cfgs))
         parts = -(-wanted // room)
         self._width = -(-wanted // parts)
@@ -381,10 +387,3 @@ class PlannerRunner(Runner):
             if bool(broken.all()):
                 track.fail(f"all {count} candidates diverged; {reasons[places[track]]}")
         return answers
-
-
-def _smallest_population(method: Any) -> int:
-    """Return the smallest number of candidates evaluated at once, which keeps environments busy."""
-    if hasattr(method, "stages"):
-        return min(map(_smallest_population, method.stages.values()))
-    return method.population
