@@ -66,8 +66,7 @@ class Step:
             family. Others are ignored.
         actions: Simulated actions, in [-1, 1], shape [T, A].
         state: State for the next iteration: nested dictionaries of arrays, numbers and strings.
-        episodes: Episodes simulated before this iteration; None: one per iteration.
-        steps: Environment steps simulated before this iteration; default: those of the episodes.
+        steps: Environment steps before this iteration; default: those of all episodes simulated so far.
         steps_forward: Environment steps simulated in this iteration without a gradient; default: those of one
             episode.
         steps_gradient: Environment steps simulated in this iteration with a gradient.
@@ -80,7 +79,6 @@ class Step:
     measures: Mapping[str, float]
     actions: np.ndarray
     state: Mapping[str, Any]
-    episodes: int | None = None
     steps: int | None = None
     steps_forward: int | None = None
     steps_gradient: int = 0
@@ -165,12 +163,11 @@ class Track:
         """Write an iteration, with the measures of some columns and the run's share of the wall time, to the
         file, and return its row; raise ResultsError if the file cannot be written."""
         horizon, before = len(step.actions), sum(self._budget.values())
-        episodes = before // horizon if step.episodes is None else step.episodes
-        steps = episodes * horizon if step.steps is None else step.steps
+        steps = before // horizon * horizon if step.steps is None else step.steps
         forward = horizon if step.steps_forward is None else step.steps_forward
         spent = zip(self._budget.items(), (forward, step.steps_gradient), strict=True)
         self._budget = {name: known + more for (name, known), more in spent}
-        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
+        row: dict[str, float] = {"iteration": self.iteration, "episodes": steps // horizon, "steps": steps}
         row |= self._budget | {name: step.measures[name] for name in columns}
         row["seconds"] = seconds
         # The first loss replaces NaN, which stands for no loss.

@@ -276,7 +276,6 @@ class PolicyRunner(Runner, ABC):
                 measures[k] | means,
                 actions[k],
                 state,
-                episodes=self.episodes,
                 steps=self.steps,
                 steps_forward=self._horizon + simulated - gradient,
                 steps_gradient=gradient,
