@@ -106,8 +106,7 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     outside = ~(mass > threshold)
     if outside.all():
         raise ArgumentError(
-            f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}; raise "
-            "sim.particles_scale or lower sim.grid_size"
+            f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}"
         )
     return distance_transform_edt(outside) / mass.shape[0]
 

@@ -182,7 +182,7 @@ class Problem:
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
         self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
         # Distances are computed once for equal targets.
-        distances = {kind: target_sdf(self.target_mass[k]) for kind, k in first.items()}
+        distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
         self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
         self.simulator.set_target(self.target_mass, np.stack(self._distances))
         self.target_mass = self.simulator.target_mass
@@ -244,7 +244,7 @@ class Problem:
         if targets:
             masses, distances = list(self.target_mass), self.distances()
             for e, (mass, distance) in targets.items():
-                masses[e], distances[e] = mass, target_sdf(mass) if distance is None else distance
+                masses[e], distances[e] = mass, target_distance(mass) if distance is None else distance
             simulator.set_target(np.stack(masses), np.stack(distances))
             self.target_mass, self._distances = simulator.target_mass, distances
             for e in targets:
@@ -258,7 +258,7 @@ class Problem:
     def distances(self) -> list[np.ndarray]:
         """Return the distances to the targets, shape [n, n, n] each."""
         if self._distances is None:
-            self._distances = [target_sdf(mass) for mass in self.target_mass]
+            self._distances = [target_distance(mass) for mass in self.target_mass]
         return list(self._distances)
 
     @property
@@ -400,6 +400,14 @@ def _warn_of_thin(scenes: Sequence[Scene]) -> None:
     }
     for line in sorted(thin):
         _log.warning("%s", line)
+
+
+def target_distance(mass: np.ndarray) -> np.ndarray:
+    """Return the distance to a target, shape [n, n, n]."""
+    try:
+        return target_sdf(mass)
+    except ValueError as error:
+        raise TargetError(f"{error}: raise sim.particles_scale or lower sim.grid_size") from None
 
 
 def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool = False) -> np.ndarray:

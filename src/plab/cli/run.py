@@ -26,16 +26,7 @@ def main(argv: Sequence[str]) -> int:
     Returns:
         Exit code: 0 if all results exist, 1 if a run failed, 2 for invalid input.
     """
-    parser = Parser("plab run", "", add_help=False)
-    add = parser.add_argument
-    add("overrides", nargs="*")
-    add("-h", "--help", action="store_true")
-    add("--help-all", action="store_true")
-    add("-m", "--multirun", action="store_true")
-    add("--cfg", choices=("job", "hydra"))
-    add("--package")
-    add("--config-dir")
-    options = parser.parse_intermixed_args(argv)
+    options = parser().parse_intermixed_args(argv)
     words, config_dir = prepared(options.overrides), options.config_dir
     if options.help or options.help_all:
         check_overrides([], config_dir)
@@ -92,6 +83,20 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     if idle := [word for word in words if re.match(r"[+]*hydra[./](launcher|sweep)", word)]:
         raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or omit it")
     return None
+
+
+def parser() -> Parser:
+    """Return the parser of the arguments."""
+    made = Parser("plab run", "", add_help=False)
+    add = made.add_argument
+    add("overrides", nargs="*")
+    add("-h", "--help", action="store_true")
+    add("--help-all", action="store_true")
+    add("-m", "--multirun", action="store_true")
+    add("--cfg", choices=("job", "hydra"))
+    add("--package")
+    add("--config-dir")
+    return made
 
 
 # ------------------------------------------------------------------------------------------------------- help

@@ -30,8 +30,8 @@ from plab.config.randomization import (
     yaws,
 )
 from plab.errors import ArgumentError, located
-from plab.objective import spread_mass, target_observation, target_sdf
-from plab.problem import Problem, drawn_scenes, make_targets
+from plab.objective import spread_mass, target_observation
+from plab.problem import Problem, drawn_scenes, make_targets, target_distance
 from plab.scenes import Body, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import RECIPES, build_target
@@ -196,7 +196,7 @@ class EpisodeRandomizer:
         with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
             same = np.array_equal(mass, base.configured_mass)
-            target = base.target if same else (mass, target_sdf(mass))
+            target = base.target if same else (mass, target_distance(mass))
         return target
 
 
@@ -241,7 +241,7 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
         simulator.set_scenes([build_scene(one) for one in filled])
         masses = make_targets(filled, simulator)
         for one, scene, mass in zip(some, simulator.scenes, masses, strict=False):
-            pool.append(_Base(one, scene, (mass, target_sdf(mass))))
+            pool.append(_Base(one, scene, (mass, target_distance(mass))))
     simulator.set_scenes(own)
     return pool
 
@@ -275,7 +275,7 @@ class Stages:
             # Equal configurations share one object, and so do their targets.
             own = {id(c): replace(c, task=replace(c.task, target=c.task.stages[number])) for c in cfgs}
             masses = make_targets([own[id(cfg)] for cfg in cfgs], problem.simulator)
-            self._targets.append([(mass, target_sdf(mass)) for mass in masses])
+            self._targets.append([(mass, target_distance(mass)) for mass in masses])
         self._targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
         self.current = np.full(len(cfgs), len(self._targets) - 1)
         self.earned = np.zeros(len(cfgs))

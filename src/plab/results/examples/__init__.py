@@ -18,8 +18,9 @@ particles."""
 def resolve(source: str | Path) -> Path:
     """Return a source of results, replacing names in :data:`EXAMPLES` by bundled archives; use ``./example``
     for a folder of that name."""
-    archive = Path(__file__).with_name(f"{source}.plab.zip.xz")
-    return _relative(archive) if str(source) in EXAMPLES else Path(source)
+    if str(source) not in EXAMPLES:
+        return Path(source)
+    return _relative(Path(__file__).with_name(f"{source}.plab.zip.xz"))
 
 
 def measurements(folder: str | Path) -> Path:
