@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.errors import ArgumentError, print_error
+from plab.errors import print_error
 from plab.problem import Problem, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
@@ -131,7 +131,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """
     try:
         problem = Problem([cfg])
-    except (ArgumentError, TargetError) as error:
+    except TargetError as error:
         print_once(f"without target and scores: {error}")
         return _recording(cfg, make_simulator([cfg]), None, actions, motion=True)
     if cfg.targets.source is not None:
