@@ -55,4 +55,4 @@ class RandomSearch(Runner):
         return Step(measures(episodes), tried, state={"iteration": track.iteration})
 
 
-FAMILY = Family(label="the best of many random actions", config=RandomSearchConfig, runner=RandomSearch)
+FAMILY = Family(config=RandomSearchConfig, runner=RandomSearch)

@@ -56,7 +56,6 @@ def arguments(method: TqcConfig, env: VecEnv) -> dict[str, Any]:
 
 FAMILY = replace(
     FAMILIES["sb3"],
-    label="truncated quantile critics",
     config=TqcConfig,
     rules={"tqc": Rule(ModelKind(TQC, arguments))},
 )

@@ -58,7 +58,6 @@ class Family:
     """A family of methods with a common runner.
 
     Attributes:
-        label: Short description of its methods.
         config: Type of the ``method`` section, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
@@ -74,7 +73,6 @@ class Family:
         methods: Appearance of methods by name; others are shown in grey.
     """
 
-    label: str
     config: type
     runner: type | str
     columns: tuple[str, ...] = ()

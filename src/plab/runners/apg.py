@@ -85,7 +85,6 @@ class ApgRunner(Runner):
 
 
 FAMILY = Family(
-    label="a policy trained with the simulator's gradient",
     config=ApgConfig,
     runner=ApgRunner,
     columns=("gradient_norm",),

@@ -126,7 +126,6 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
 
 
 FAMILY = Family(
-    label="a policy that imitates the actions of a dataset",
     config=BcConfig,
     runner=BcRunner,
     columns=BcRunner.columns,

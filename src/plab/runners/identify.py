@@ -234,7 +234,6 @@ def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
 
 
 FAMILY = Family(
-    label="scene parameters fitted to observed particles or depth images",
     config=IdentifyConfig,
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),

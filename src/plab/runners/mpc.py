@@ -175,7 +175,6 @@ class MpcRunner(PlannerRunner):
 
 
 FAMILY = Family(
-    label="actions from a plan that is updated every few steps",
     config=MpcConfig,
     runner=MpcRunner,
     ranking="score",

@@ -142,7 +142,6 @@ class PodsRunner(ImitationRunner):
 
 
 FAMILY = Family(
-    label="a policy that imitates its own episodes, improved by the simulator's gradient",
     config=PodsConfig,
     runner=PodsRunner,
     columns=PodsRunner.columns,

@@ -159,7 +159,6 @@ class RlRunner(PolicyRunner):
 
 
 FAMILY = Family(
-    label="a policy that learns from rewards",
     config=RlConfig,
     runner=RlRunner,
     columns=("train_reward", "train_score"),
@@ -182,7 +181,6 @@ FAMILY = Family(
 )
 
 SB3 = Family(
-    label="a learning algorithm with the interface of Stable-Baselines3",
     config=RlConfig,
     runner="plab.runners.sb3:Sb3Runner",
     columns=FAMILY.columns,

@@ -336,7 +336,6 @@ class Cmaes(Sampler):
 
 
 FAMILY = Family(
-    label="an action sequence optimised by sampling many candidates",
     config=PlannerConfig,
     runner=PlannerRunner,
     ranking="score",

@@ -154,7 +154,6 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 
 
 FAMILY = Family(
-    label="a policy trained with the simulator's gradient and a value function",
     config=ShacConfig,
     runner=ShacRunner,
     columns=ShacRunner.columns,

@@ -302,7 +302,6 @@ def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 
 
 FAMILY = Family(
-    label="an action sequence improved by its gradient",
     config=TrajectoryConfig,
     runner=TrajectoryRunner,
     columns=("gradient_norm", "kept_score"),
