@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -375,7 +376,7 @@ def test_a_batch_gives_each_run_what_it_gives_alone(finished, others, halved, tm
         assert (got.provenance["batch"], want.provenance["batch"]) == (2, 1)
 
 
-def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, monkeypatch) -> None:
+def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, monkeypatch, capsys) -> None:
     scores = [results["cem"].iterations["score"].tolist() for results in (finished, others)]
 
     def until(enough: float) -> list[list[float]]:
@@ -387,11 +388,16 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
     enough = next(one for one in sorted(scores[0] + scores[1]) if len(set(map(len, until(one)))) == 2)
     for module in (runner, checking):
         monkeypatch.setattr(module, "SOLVED", enough)
-    cfgs = [make_config(tmp_path, "cem"), make_config(tmp_path, "cem", *OTHER)]
+    monkeypatch.setattr(runner, "PLAIN_EVERY", 1)
+    cfgs = [make_config(tmp_path, "cem", "progress=true"), make_config(tmp_path, "cem", *OTHER)]
     run_batch(cfgs, cache=CACHE)
     results = [read(cfg.path) for cfg in cfgs]
     assert [result.iterations["score"].tolist() for result in results] == until(enough)
     assert [faults(result) for result in results] == [[], []]
+    # The progress is that of the runs that are not solved.
+    longer = max(len(result.iterations) for result in results)
+    counts = [int(count) for count in re.findall(r" (\d)/4,", capsys.readouterr().out)]
+    assert counts == [*range(1, longer), 4]
     shorter = min(results, key=lambda result: len(result.iterations))
     monkeypatch.setattr(checking, "SOLVED", shorter.iterations["score"].max())
     assert faults(shorter) == []

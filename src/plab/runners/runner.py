@@ -319,7 +319,8 @@ class Runner:
     def extent(self) -> tuple[int, int, int]:
         """Return the progress: steps done, total, and interval of reports without a terminal."""
         total = max(self.iterations(track) for track in self.tracks)
-        return min(track.iteration for track in self.tracks), total, PLAIN_EVERY
+        done = [track.iteration for track in self.tracks if track.open and self.has_more(track)]
+        return min(done, default=total), total, PLAIN_EVERY
 
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
         """Return the text of progress after an iteration, given the means of its rows by column."""
