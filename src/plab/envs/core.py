@@ -22,10 +22,10 @@ from plab.config import Config, load_config, ranges
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
 from plab.envs.observations import Array, Observer, Sensors, mapped, spaces
-from plab.envs.randomization import EpisodeRandomizer, Stages, staged
+from plab.envs.randomization import EpisodeRandomizer
 from plab.errors import ArgumentError
 from plab.objective import earth_movers_distances
-from plab.problem import Problem, build_scenes, kinds_of, make_simulator, require_alike
+from plab.problem import Problem, build_scenes, make_simulator, require_alike
 from plab.scenes import CONTACTS, Camera
 from plab.sim import SimulationError, Simulator, State
 from plab.sim.tensors import Constants, on_device
@@ -160,9 +160,8 @@ class EpisodeState:
     Attributes:
         simulation: Particles and manipulators, shape [batch, ...] each.
         episodes: Attributes of the batch that belong to its episodes, by name.
-        values: Sampled parameters of each environment, by key.
+        values: Sampled parameters and stage of each environment, by key.
         starts: Losses and soft IoUs of the initial states, shape [2, batch].
-        stages: Numbers, accumulated rewards and scores of the stages; empty without stages.
         changed_by_hand: The batch's ``changed_by_hand``.
     """
 
@@ -170,11 +169,10 @@ class EpisodeState:
     episodes: Mapping[str, Any]
     values: tuple[Values, ...]
     starts: np.ndarray
-    stages: tuple[np.ndarray, ...] = ()
     changed_by_hand: int = 0
 
 
-_EPISODES = ("_steps", "failures", "_last", "_seeds", "_episodes", "_over")
+_EPISODES = ("_steps", "failures", "_last", "_seeds", "_episodes", "_over", "_earned", "_stage_scores")
 """Attributes of a batch that belong to its episodes."""
 
 
@@ -186,7 +184,7 @@ class EpisodeBatch:
         contact: Contact model of the episodes, ``hard`` or ``soft``.
         size: Number of sub-environments.
         horizon: Steps of an episode.
-        randomizer: Randomisation of the episodes.
+        randomizer: Randomisation and stages of the episodes.
         failures: Diverged environments, with time and reason.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
@@ -268,14 +266,8 @@ class EpisodeBatch:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
         require_alike([*self.configs[:1], *cfgs])
         cfgs = self._ranged(cfgs)
-        scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
-        simulator.reset()
-        if self.randomizer.changed or self._stages or kinds_of(cfgs) != kinds_of(self.configs):
-            # After an error, the batch is not associated with any configurations.
-            self.configs: tuple[Config, ...] = ()
-            simulator.set_scenes(scenes)
-            problem = Problem(cfgs, simulator)
-        self._take(cfgs, problem)
+        self._simulator.set_scenes(build_scenes(cfgs))
+        self._take(cfgs, Problem(cfgs, self._simulator))
         self._begin()
 
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
@@ -291,15 +283,17 @@ class EpisodeBatch:
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
-        self.randomizer = EpisodeRandomizer(cfgs, problem)
-        self._stages = Stages(cfgs, problem) if self._goes_by_stages and any(map(staged, cfgs)) else None
+        self.randomizer = EpisodeRandomizer(cfgs, problem, stages=self._goes_by_stages)
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
         """Observe the initial states before any episode has started."""
         self.changed_by_hand = 0
-        if self._stages:
-            self._stages.begin(range(self.size), self.problem)
+        stages = self.randomizer.last_stage
+        # Sum of the rewards of completed stages, and score of each stage, 0 for future ones.
+        self._earned, self._stage_scores = np.zeros(self.size), np.zeros((self.size, stages + 1))
+        if stages:
+            self.randomizer.enter_stages(dict.fromkeys(range(self.size), 0), self.problem)
             self.problem.refresh()
         # No step is left before the first reset.
         self._steps = np.full(self.size, self.horizon)
@@ -354,8 +348,6 @@ class EpisodeBatch:
             state = self.get_state() if keep else None
             self.changed_by_hand += 1
             self.randomizer.follow(self.problem)
-            if self._stages:
-                self._stages.follow(self.problem)
             self._begin_again(state)
 
     def _begin_again(self, state: EpisodeState | None) -> None:
@@ -408,10 +400,9 @@ class EpisodeBatch:
         entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
         drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}
         changed = self.randomizer.put(drawn, self.problem)
-        if self._stages:
-            changed |= self._stages.begin(rows, self.problem)
         self._episodes[rows] = numbers
         self._steps[rows], self._over[rows] = 0, False
+        self._earned[rows], self._stage_scores[rows] = 0.0, 0.0
         self.failures = {e: text for e, text in self.failures.items() if e not in rows}
         self._simulator.reset(None if environments is None else rows)
         self._restart(rows, like, changed)
@@ -484,34 +475,34 @@ class EpisodeBatch:
         ended = np.flatnonzero(self._over & ~np.asarray(idle))
         if self._transports and (rows := np.setdiff1d(ended, list(self.failures))).size:
             self._note_ends(rows, info)
-        if self._stages:
-            reward = self._go_on(self._stages, reward, info, actions)
+        if self.randomizer.last_stage:
+            reward = self._go_on(reward, info, actions)
             observation = mapped(_copy, self._last[0])
         done = Transition(observation, reward, terminated, truncated, info, dict(self.failures))
         if self.listener is not None:
             self.listener(actions, done)
         return done
 
-    def _go_on(self, stages: Stages, reward: Array, info: dict[str, Any], like: Array) -> Array:
+    def _go_on(self, reward: Array, info: dict[str, Any], like: Array) -> Array:
         """Advance environments that have reached their stage's target; return the rewards."""
-        reward = reward + Constants(stages.earned.copy()).like(like)
-        score = _on_host(info["score"])
-        stages.scores[np.arange(self.size), stages.current] = score
-        reached = score >= self._success_score
+        reward = reward + Constants(self._earned.copy()).like(like)
+        score, stages = _on_host(info["score"]), self.randomizer.stages
+        self._stage_scores[np.arange(self.size), stages] = score
+        reached = (score >= self._success_score) & (stages < self.randomizer.last_stage)
         reached[list(self.failures)] = False
-        rows = np.flatnonzero(reached & ~stages.last).tolist()
+        rows = np.flatnonzero(reached).tolist()
         if rows:
-            stages.earned[rows] = _on_host(reward)[rows]
-            stages.enter(stages.current + np.isin(np.arange(self.size), rows), self.problem)
+            self._earned[rows] = _on_host(reward)[rows]
+            self.randomizer.enter_stages({e: int(stages[e]) + 1 for e in rows}, self.problem)
             self._restart(rows, like, changed=True)
         info |= self._stage_info(info["score"])
         return reward
 
     def _stage_info(self, like: Array) -> dict[str, Any]:
         """Return the number of each environment's stage, and the score reached in each stage."""
-        if self._stages is None:
+        if not self.randomizer.last_stage:
             return {}
-        known = {"stage": self._stages.current, "stage_scores": self._stages.scores}
+        known = {"stage": self.randomizer.stages, "stage_scores": self._stage_scores}
         device = on_device(like)
         return {key: like.new_tensor(value) if device else value.copy() for key, value in known.items()}
 
@@ -524,9 +515,8 @@ class EpisodeBatch:
             simulation.x[e], simulation.v[e], simulation.C[e], simulation.F[e] = 0.5, 0.0, 0.0, np.eye(3)
         starts = self._initial_loss.like(None), self.problem.initial_iou
         episodes = {name: copy.deepcopy(getattr(self, name)) for name in _EPISODES}
-        stages = self._stages.saved() if self._stages else ()
         values = tuple(self.randomizer.values)
-        return EpisodeState(simulation, episodes, values, np.array(starts), stages, self.changed_by_hand)
+        return EpisodeState(simulation, episodes, values, np.array(starts), self.changed_by_hand)
 
     @_alone
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
@@ -538,12 +528,10 @@ class EpisodeBatch:
         self._simulator.set_state(state.simulation)
         self._follow_changes(keep=False)
         changed = self.randomizer.put(dict(enumerate(state.values)), self.problem)
-        if self._stages:
-            self._stages.restore(state.stages, self.problem)
         if state.changed_by_hand != self.changed_by_hand:
             self._begin_again(state)
             return self._shown()
-        if changed or self._stages:
+        if changed or self.randomizer.last_stage:
             self._changes = self._simulator.changes
             self.problem.note_starts(range(self.size), state.starts[1])
             self._initial_loss = Constants(state.starts[0])
@@ -659,8 +647,8 @@ class EpisodeBatch:
     def _info(self, terms: Array, iou: Array, requested: Mapping[str, Array]) -> dict[str, Any]:
         score, printed = self.problem.scores_of(iou)
         drawn, success = self.randomizer.info(), score >= self._success_score
-        if self._stages:
-            success = success & (Constants(self._stages.last).like(iou) > 0.0)
+        if last := self.randomizer.last_stage:
+            success = success & (Constants(self.randomizer.stages == last).like(iou) > 0.0)
         return {
             "loss": self.problem.loss_of(terms),
             **{f"loss_{name}": terms[:, k] for k, name in enumerate(self.problem.term_names)},

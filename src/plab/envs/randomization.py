@@ -37,6 +37,9 @@ from plab.sim import Simulator
 from plab.targets import RECIPES, build_target
 from plab.targets.recipes import TensorRecipe
 
+STAGE = "stage"
+"""Key of the number of the stage among the values of a sub-environment."""
+
 _OF_TARGET = ("target.", "manipulators.")
 """Prefixes of the keys that a target may depend on."""
 
@@ -50,10 +53,11 @@ class _Base:
 
     cfg: Config
     scene: Scene
-    target: Target
+    targets: list[Target]
+    """Targets of the stages, in order; a single one without stages."""
 
     def __post_init__(self) -> None:
-        self.configured_mass = self.target[0]
+        self.configured_mass = self.targets[-1][0]
 
     @functools.cached_property
     def particles(self) -> np.ndarray:
@@ -67,22 +71,25 @@ class _Base:
         # Rounded as in the simulator, so that the result is the same as from its initial state.
         x = self.particles.astype(self.cfg.sim.precision).astype(np.float64)
         mass = spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor_stencil)
-        return target_observation(mass, self.target[0])
+        return target_observation(mass, self.targets[-1][0])
 
 
 class EpisodeRandomizer:
-    """Randomisation of the sub-environments of a batch.
+    """Randomisation and stages of the sub-environments of a batch.
 
     Attributes:
-        values: Sampled values of each sub-environment, by dotted key; empty without randomisation.
+        values: Sampled values of each sub-environment, by dotted key, and the number of its ``stage``; empty
+            without randomisation and stages.
+        last_stage: Number of the last stage, which has the task's own target; 0 without stages.
         scenes: Scenes with the lowest and the highest values, which determine the bounds of observations.
     """
 
-    def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Build the random scenes, and check that scenes can be simulated over the whole ranges.
+    def __init__(self, cfgs: Sequence[Config], problem: Problem, *, stages: bool) -> None:
+        """Build the random scenes and, with ``stages``, the targets of ``task.stages``; check that scenes can
+        be simulated over the whole ranges.
 
         ``cfgs`` are of the form of :func:`~plab.config.randomization.with_own_materials`; raise ConfigError
-        if a range is invalid.
+        if a range is invalid, or the stages do not fit together.
         """
         self._cfgs = list(cfgs)
         self.values: list[Values] = [{} for _ in cfgs]
@@ -91,8 +98,11 @@ class EpisodeRandomizer:
         self._pools = {
             key: _pool(cfg, problem.simulator) for key, cfg in unique.items() if SCENES in cfg.task.randomize
         }
-        targets = zip(problem.target_mass, problem.distances(), strict=True)
-        self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, targets, strict=True)]
+        targets: list[list[Target]] = _stage_targets(cfgs, problem) if stages else []
+        targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
+        self.last_stage = len(targets) - 1
+        by_environment = map(list, zip(*targets, strict=True))
+        self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, by_environment, strict=True)]
         # With the changes that the caller has made in the simulator.
         self._scenes = list(problem.scenes)
         self._placed: list[Any] = [(base, {}, _places(base.scene)) for base in self._bases]
@@ -103,9 +113,9 @@ class EpisodeRandomizer:
                 self.scenes += [self._checked(one) for one in (extremes(cfg) if cfg.task.randomize else [])]
 
     @property
-    def changed(self) -> bool:
-        """True if a sub-environment differs from its configuration."""
-        return any(self.values)
+    def stages(self) -> np.ndarray:
+        """Number of each sub-environment's stage, shape [batch]."""
+        return np.array([values.get(STAGE, 0) for values in self.values])
 
     def follow(self, problem: Problem) -> None:
         """Keep scenes and targets that the caller has set in the simulator, except for sampled values."""
@@ -114,7 +124,7 @@ class EpisodeRandomizer:
                 self._scenes[e] = _applied(self._scenes[e], before, after)
                 self._placed[e] = *self._placed[e][:2], _places(after)
         for e, target in problem.foreign_targets().items():
-            self._bases[e].target = target
+            self._bases[e].targets[self.values[e].get(STAGE, -1)] = target
 
     def noise(self) -> np.ndarray:
         """Return the standard deviations of the noise on observations, shape [batch]."""
@@ -122,7 +132,7 @@ class EpisodeRandomizer:
 
     def info(self) -> dict[str, np.ndarray]:
         """Return the sampled values by dotted key, each of shape [batch, ...]; NaN without randomisation."""
-        known = {key: value for values in self.values for key, value in values.items()}
+        known = {key: value for values in self.values for key, value in values.items() if key != STAGE}
         return {
             key: np.array([values.get(key, np.full(np.shape(like), np.nan)) for values in self.values])
             for key, like in sorted(known.items())
@@ -153,17 +163,23 @@ class EpisodeRandomizer:
             place = base, yaws(cfg.task, own), _places(scenes[e])
             if place != self._placed[e]:
                 particles[e] = _moved(*place)
-            follows = [key for key in own if key.startswith(_OF_TARGET)]
-            target = base, {key: own[key] for key in follows}
+            follows = [key for key in own if key.startswith(_OF_TARGET) and not self.last_stage]
+            target = base, {key: own[key] for key in (*follows, STAGE) if key in own}
             if target != self._targets[e]:
-                targets[e] = self._target(base, cfg, scenes[e]) if follows else base.target
+                known = base.targets[own.get(STAGE, -1)]
+                targets[e] = self._target(base, cfg, scenes[e]) if follows else known
             self._placed[e], self._targets[e], self.values[e] = place, target, dict(own)
         problem.set_episode_starts(scenes, particles, targets)
         return True
 
+    def enter_stages(self, stages: Mapping[int, int], problem: Problem) -> None:
+        """Set the targets of some sub-environments to those of their next stages."""
+        self.put({e: self.values[e] | {STAGE: stage} for e, stage in stages.items()}, problem)
+
     def sample(self, e: int, seed: Sequence[int], given: Mapping[str, Any]) -> Values:
-        """Sample the next episode of a sub-environment from its entropy. Values by dotted key in ``given``
-        replace samples, for all or one per sub-environment; raise ValueError if a key is unknown."""
+        """Sample the next episode of a sub-environment, which begins with its first stage, from its entropy.
+        Values by dotted key in ``given`` replace samples, for all or one per sub-environment; raise
+        ValueError if a key is unknown."""
         cfg = self._cfgs[e]
         pool = self._pools.get(id(cfg), ())
         rng = np.random.default_rng(list(seed))
@@ -178,7 +194,7 @@ class EpisodeRandomizer:
             raise ArgumentError(
                 f"options['scene']: {values[SCENE]} must be below task.randomize.scenes={len(pool)}"
             )
-        return values
+        return values | ({STAGE: 0} if self.last_stage else {})
 
     @staticmethod
     def _checked(cfg: Config) -> Scene:
@@ -192,11 +208,11 @@ class EpisodeRandomizer:
         if cfg.targets.source is not None or not issubclass(kind, TensorRecipe):
             if cfg.task.target != base.cfg.task.target:
                 raise ArgumentError("this target cannot be randomised: use task.randomize.scenes")
-            return base.target
+            return base.targets[-1]
         with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
             same = np.array_equal(mass, base.configured_mass)
-            target = base.target if same else (mass, target_distance(mass))
+            target = base.targets[-1] if same else (mass, target_distance(mass))
         return target
 
 
@@ -241,78 +257,22 @@ def _pool(cfg: Config, simulator: Simulator) -> list[_Base]:
         simulator.set_scenes([build_scene(one) for one in filled])
         masses = make_targets(filled, simulator)
         for one, scene, mass in zip(some, simulator.scenes, masses, strict=False):
-            pool.append(_Base(one, scene, (mass, target_distance(mass))))
+            pool.append(_Base(one, scene, [(mass, target_distance(mass))]))
     simulator.set_scenes(own)
     return pool
 
 
-# -------------------------------------------------------------------------------------------------- stages
-
-
-def staged(cfg: Config) -> bool:
-    """Return True if the task has stages; raise ConfigError if its targets are randomised as well."""
-    if cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize):
+def _stage_targets(cfgs: Sequence[Config], problem: Problem) -> list[list[Target]]:
+    """Build the targets of ``task.stages``, by stage and sub-environment; raise ConfigError if the
+    sub-environments differ in number of stages, or their targets are randomised as well."""
+    if len({len(cfg.task.stages) for cfg in cfgs}) > 1:
+        raise ConfigError("task.stages differ in number between sub-environments")
+    if any(cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize) for cfg in cfgs):
         raise ConfigError("task.randomize cannot have scenes or targets in a task with task.stages")
-    return bool(cfg.task.stages)
-
-
-class Stages:
-    """Stages of the sub-environments of a batch; the last stage has the task's own target.
-
-    Attributes:
-        current: Number of each sub-environment's stage, shape [batch].
-        earned: Sum of the rewards of completed stages, shape [batch].
-        scores: Score of each stage, shape [batch, stage]; 0 for future stages.
-    """
-
-    def __init__(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Build the targets; ``problem`` has those of the last stage. Raise ConfigError if the
-        sub-environments have different numbers of stages."""
-        if len({len(cfg.task.stages) for cfg in cfgs}) > 1:
-            raise ConfigError("task.stages differ in number between sub-environments")
-        self._targets = []
-        for number in range(len(cfgs[0].task.stages)):
-            # Equal configurations share one object, and so do their targets.
-            own = {id(c): replace(c, task=replace(c.task, target=c.task.stages[number])) for c in cfgs}
-            masses = make_targets([own[id(cfg)] for cfg in cfgs], problem.simulator)
-            self._targets.append([(mass, target_distance(mass)) for mass in masses])
-        self._targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
-        self.current = np.full(len(cfgs), len(self._targets) - 1)
-        self.earned = np.zeros(len(cfgs))
-        self.scores = np.zeros((len(cfgs), len(self._targets)))
-
-    @property
-    def last(self) -> np.ndarray:
-        """Mask of the sub-environments in their last stage, shape [batch]."""
-        return self.current == len(self._targets) - 1
-
-    def enter(self, stages: np.ndarray, problem: Problem) -> None:
-        """Set the targets of all sub-environments to the targets of their stages, shape [batch]."""
-        rows = np.flatnonzero(stages != self.current)
-        if rows.size:
-            problem.set_episode_starts(
-                problem.scenes, {}, {int(e): self._targets[stages[e]][e] for e in rows}
-            )
-        self.current = stages
-
-    def begin(self, rows: Sequence[int], problem: Problem) -> bool:
-        """Reset some sub-environments to the first stage; return whether any of them was in another stage."""
-        stages, rows = self.current.copy(), list(rows)
-        stages[rows], self.earned[rows], self.scores[rows] = 0, 0.0, 0.0
-        changed = bool((stages != self.current).any())
-        self.enter(stages, problem)
-        return changed
-
-    def follow(self, problem: Problem) -> None:
-        """Keep targets that the caller has set in the simulator as those of the current stages."""
-        for e, target in problem.foreign_targets().items():
-            self._targets[self.current[e]][e] = target
-
-    def saved(self) -> tuple[np.ndarray, ...]:
-        """Return a copy of the episode's state, for :meth:`restore`."""
-        return self.current.copy(), self.earned.copy(), self.scores.copy()
-
-    def restore(self, saved: tuple[np.ndarray, ...], problem: Problem) -> None:
-        """Restore the state of the current episode."""
-        current, self.earned, self.scores = (part.copy() for part in saved)
-        self.enter(current, problem)
+    stages = []
+    for number in range(len(cfgs[0].task.stages)):
+        # Equal configurations share one object, and so do their targets.
+        own = {id(c): replace(c, task=replace(c.task, target=c.task.stages[number])) for c in cfgs}
+        masses = make_targets([own[id(cfg)] for cfg in cfgs], problem.simulator)
+        stages.append([(mass, target_distance(mass)) for mass in masses])
+    return stages
