@@ -21,7 +21,7 @@ from plab.results import BUDGETS, RunFile, RunResult, checking, read
 from plab.results.checking import faults
 from plab.runners import RunError, Step, Track, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
-from plab.runners.planner import Answer, CandidateStart, Request, make_planner
+from plab.runners.planner import Answer, Request, make_planner
 from plab.runners.searches import actions_of, knots_of
 from plab.scenes import sample_particles
 from plab.sim import SimulationError
@@ -33,11 +33,8 @@ from toy_runner import COARSE_32
 
 SHAPE = (5, 2)
 GOAL = torch.linspace(-0.9, 0.6, 10, dtype=torch.float64).reshape(SHAPE)
-START = CandidateStart(
-    SimpleNamespace(horizon=SHAPE[0], action_dim=SHAPE[1], tools=(), kinematics=None),
-    np.zeros(1),
-    torch.device("cpu"),
-)
+SCENE = SimpleNamespace(horizon=SHAPE[0], action_dim=SHAPE[1], tools=(), kinematics=None)
+START = ContactStarts(SCENE, np.zeros(1)), torch.device("cpu")
 
 
 def rule(name: str, *overrides: str) -> MethodConfig:
@@ -95,7 +92,7 @@ def drawn(mean: torch.Tensor, std: torch.Tensor | float, iteration: int, best: t
 @pytest.mark.parametrize(("elites", "fitted"), [(2, 2), (5, 5), (6, 2)])
 def test_cem_fits_mean_and_spread_to_the_elites(elites: int, fitted: int) -> None:
     settings = (f"elites={elites}", "smoothing=0.1", "least_spread=0.3", "spread=0.5")
-    search = make_planner(rule("cem", *settings), START)
+    search = make_planner(rule("cem", *settings), *START)
     first, second, third = (iterate(search, i)[0][0].actions for i in range(3))
     torch.testing.assert_close(first, 0.3 * uniform(random(0), 5))
     torch.testing.assert_close(second, drawn(best_of(first), 0.5, 1, best_of(first)))
@@ -106,7 +103,7 @@ def test_cem_fits_mean_and_spread_to_the_elites(elites: int, fitted: int) -> Non
 
 def test_mppi_weighs_draws_by_their_costs() -> None:
     settings = ("temperature=0.5", "decay=0.8", "spread=0.5")
-    search = make_planner(rule("mppi", *settings), START)
+    search = make_planner(rule("mppi", *settings), *START)
     first, second = iterate(search, 0)[0][0].actions, iterate(search, 1, broken=[3])[0][0].actions
     torch.testing.assert_close(second, drawn(best_of(first), 0.5, 1, best_of(first)))
     through = second[[0, 1, 2, 4]]
@@ -118,7 +115,7 @@ def test_mppi_weighs_draws_by_their_costs() -> None:
 
 
 def test_cmaes_draws_as_the_library_does() -> None:
-    search = make_planner(rule("cmaes", "spread=0.4"), START)
+    search = make_planner(rule("cmaes", "spread=0.4"), *START)
     best = best_of(iterate(search, 0)[0][0].actions)
     bounds = np.tile([-1.0, 1.0], (best.numel(), 1))
     theirs = CMA(best.flatten().numpy(), 0.4, bounds=bounds, n_max_resampling=0, population_size=5)
@@ -138,7 +135,7 @@ def test_cmaes_draws_as_the_library_does() -> None:
 def test_multistart_descends_with_adam_and_replaces_the_worse_half() -> None:
     settings = ("lrs=[0.1,0.02]", "updates=2", "replace_every=2", "fresh=0.5", "iterations=4")
     soft = ("softness=100", "softness_end=800", "action_init=0.25")
-    search = make_planner(rule("multistart", *settings, *soft), START)
+    search = make_planner(rule("multistart", *settings, *soft), *START)
     rates = [0.1, 0.02, 0.1, 0.02, 0.1]
 
     def descended(start: torch.Tensor, steps: int) -> torch.Tensor:
@@ -178,7 +175,7 @@ def test_stages_begin_from_the_best_of_the_stage_before() -> None:
     words += [f"method.stages.{name}.contact_starts=0" for name in ("search", "descent")]
     words += ["method.stages.descent.population=5", "method.stages.descent.fresh=0.4"]
     method = load_config(words).method
-    stages = make_planner(method, START)
+    stages = make_planner(method, *START)
     shown = [iterate(stages, 0), iterate(stages, 1)]
     (last,), first = shown[1][0], iterate(stages, 2)[0][0]
     best = max((one for _, one in shown), key=lambda one: one[1]["score"])
@@ -188,12 +185,12 @@ def test_stages_begin_from_the_best_of_the_stage_before() -> None:
     torch.testing.assert_close(first.actions[3:], 0.3 * uniform(random(2), 2))
     # A search takes over the better half of what it has room for.
     found = 0.3 * uniform(random(7), 4)
-    first = next(make_planner(rule("cem", "elites=2"), START).plan(random(0), found))
+    first = next(make_planner(rule("cem", "elites=2"), *START).plan(random(0), found))
     torch.testing.assert_close(first.actions, torch.cat([found[:2], 0.3 * uniform(random(0), 3)]))
 
 
 def test_a_search_in_soft_contact_shows_the_better_half_in_the_hard_model() -> None:
-    search = make_planner(rule("cem", "elites=2", "contact=soft", "softness=300", "objective=final"), START)
+    search = make_planner(rule("cem", "elites=2", "contact=soft", "softness=300", "objective=final"), *START)
     (soft, hard), best = iterate(search, 0)
     assert (soft.softness, hard.softness, soft.gradient, hard.gradient) == (300, None, "", "")
     order = judged(soft).measures["final_loss"].argsort()
@@ -434,7 +431,7 @@ def test_candidates_start_at_the_body_as_often_as_asked_for() -> None:
     target[20:30, 2, 30:40] = 1.0
     starts = ContactStarts(scene, target)
     assert not np.array_equal(starts.draw(3, seed=1), starts.draw(3, seed=2))
-    drawn = CandidateStart(scene, target, torch.device("cpu")).draw(cfg.method, 6, random(0))
+    drawn = make_planner(cfg.method, starts, torch.device("cpu")).draw(6, random(0))
     again = random(0)
     unit = torch.rand(drawn.shape, generator=again, dtype=torch.float64)
     seed = int(torch.randint(2**31, (1,), generator=again))

@@ -47,11 +47,15 @@ REACH = (0.3, 1.0)
 
 
 class ContactStarts:
-    """Initial action sequences for a scene and its target."""
+    """Initial action sequences for a scene and its target.
+
+    Attributes:
+        scene: The scene.
+    """
 
     def __init__(self, scene: Scene, target: np.ndarray) -> None:
         """Store the scene and the target's mass tensor, shape [n, n, n]."""
-        self._scene, self._target = scene, target
+        self.scene, self._target = scene, target
         self._tools = [m for m in scene.tools if m.action_dim]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
@@ -68,7 +72,7 @@ class ContactStarts:
         displacement of the bodies. The other joints move by a random common amount, as in closing a hand,
         plus individual ones.
         """
-        chain, steps = self._scene.kinematics, self._scene.horizon
+        chain, steps = self.scene.kinematics, self.scene.horizon
         if chain is None:
             return own
         first = max(1, int(steps * rng.uniform(0.3, 0.6)))
@@ -90,7 +94,7 @@ class ContactStarts:
     def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return points of the bodies, shape [point, 3], their displacements, same shape, and the indices of
         their bodies."""
-        scene = self._scene
+        scene = self.scene
         body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
         # Distributed evenly over particles and mass, so that all bodies and parts of the target are
         # represented, with at least one point per body.
@@ -119,7 +123,7 @@ class ContactStarts:
             direction = ways[k] / lengths[k]
             track = ActionTrack(tool)
             track.go(_action(tool, self._to_touch(tool, points[body == body[k]], points[k], direction)))
-            left = max(1, int((self._scene.horizon - len(track)) * rng.uniform(0.5, 1.0)))
+            left = max(1, int((self.scene.horizon - len(track)) * rng.uniform(0.5, 1.0)))
             track.go(_action(tool, rng.uniform(*OVERSHOOT) * ways[k]), left)
             tracks.append(track)
         return self._actions(tracks)
@@ -138,9 +142,9 @@ class ContactStarts:
             tracks.append(track)
         together = max(map(len, tracks), default=0)
         # Manipulators that hold a body between them must move at the same speed.
-        left = max(2, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
+        left = max(2, int((self.scene.horizon - together) * rng.uniform(0.5, 1.0)))
         # Every second path leads over other bodies.
-        rise = rng.uniform(*ARCH) if len(self._scene.bodies) > 1 and rng.integers(2) else 0.0
+        rise = rng.uniform(*ARCH) if len(self.scene.bodies) > 1 and rng.integers(2) else 0.0
         arch = np.array([0.0, rise, 0.0])
         for track, tool in zip(tracks, self._tools, strict=True):
             half = middle[self._owner(tool)] / 2
@@ -151,7 +155,7 @@ class ContactStarts:
 
     def _owner(self, tool: Manipulator) -> int:
         """Return the index of the body with the centre nearest to a manipulator."""
-        centres = np.array([body.center for body in self._scene.bodies])
+        centres = np.array([body.center for body in self.scene.bodies])
         return int(np.linalg.norm(centres - np.asarray(tool.position), axis=1).argmin())
 
     def _to_touch(
@@ -169,7 +173,7 @@ class ContactStarts:
         return place - np.asarray(tool.position)
 
     def _actions(self, tracks: Sequence[ActionTrack]) -> np.ndarray:
-        steps = self._scene.horizon
+        steps = self.scene.horizon
         return np.concatenate([np.zeros((steps, 0)), *(track.first(steps) for track in tracks)], axis=1)
 
 

@@ -21,7 +21,6 @@ from plab.config.families import Appearance, Family, family
 from plab.plugins import torch
 from plab.runners.planner import (
     Asking,
-    CandidateStart,
     Planner,
     PlannerConfig,
     PlannerRunner,
@@ -71,9 +70,9 @@ class GradientPlanner(Planner):
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
         """Start from the best actions so far, or from random ones."""
-        seed = int(torch.randint(2**31, (1,), generator=random, device=self.start.device))
+        seed = int(torch.randint(2**31, (1,), generator=random, device=self.device))
         kind = family(self.method.family).rules[self.method.optimizer].what
-        self._rule = kind(self.method, self.start.shape, seed)
+        self._rule = kind(self.method, self.shape, seed)
         if len(found):
             self._rule.actions = found[0].cpu().numpy()
 
@@ -90,7 +89,7 @@ class GradientPlanner(Planner):
 
     def candidates(self) -> Tensor:
         """Return the actions, shape [1, T, A]."""
-        return torch.as_tensor(self._rule.actions, device=self.start.device)[None]
+        return torch.as_tensor(self._rule.actions, device=self.device)[None]
 
 
 class MpcRunner(PlannerRunner):
@@ -117,17 +116,20 @@ class MpcRunner(PlannerRunner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
+        from plab.runners.contact_starts import ContactStarts
+
         method, (track,) = self.method, self.tracks
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)
-        start = CandidateStart(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
+        starts = ContactStarts(replace(scene, horizon=ahead), self.problem.target_mass[0])
         own: Any = method.planner
         spent = np.zeros(2, int)
         if isinstance(method.planner, TrajectoryConfig):
-            planner: Planner = GradientPlanner(own, start)
+            planner: Planner = GradientPlanner(own, starts, self._device)
         else:
             # Contact starts only apply at the beginning of the episode.
-            planner = make_planner(replace(own, contact_starts=0.0) if taken else own, start)
+            own = replace(own, contact_starts=0.0) if taken else own
+            planner = make_planner(own, starts, self._device)
         for number in range(own.iterations):
             random = self.random(track.cfg.seed, track.iteration, number)
             _, steps = self.drive({track: planner.plan(random, self._found[:, :ahead])})

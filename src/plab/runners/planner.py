@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from plab.problem import Episodes
-    from plab.scenes import Scene
+    from plab.runners.contact_starts import ContactStarts
 
 OBJECTIVES = ("loss", "final", "score")
 
@@ -101,44 +101,20 @@ Asking: TypeAlias = "Generator[Request, Answer, Shown]"
 candidate's actions in [-1, 1], shape [T, A], and its measures."""
 
 
-class CandidateStart:
-    """Source of a run's first candidates.
-
-    Attributes:
-        shape: Steps T and length A of the action vector.
-        device: Device of tensors.
-    """
-
-    def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
-        """Store the scene and the target, a mass tensor of shape [n, n, n]."""
-        from plab.runners.contact_starts import ContactStarts
-
-        self.shape, self.device = (scene.horizon, scene.action_dim), device
-        self._contact = ContactStarts(scene, target)
-
-    def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
-        """Sample candidates, shape [count, T, A]: contact starts first, then uniform ones."""
-        size = (count, *self.shape)
-        unit = torch.rand(size, generator=random, dtype=torch.float64, device=self.device)
-        drawn = (2.0 * unit - 1.0) * method.action_init
-        if contacts := round(method.contact_starts * count):
-            seed = int(torch.randint(2**31, (1,), generator=random, device=self.device))
-            drawn[:contacts] = torch.as_tensor(self._contact.draw(contacts, seed)).to(drawn)
-        return drawn
-
-
 class Planner(ABC):
     """Search of one run; subclasses define its start and an iteration.
 
     Attributes:
         method: The ``method`` section.
-        start: Source of the first candidates.
+        shape: Steps T and length A of the action vector.
+        device: Device of tensors.
         memory: Tensors that the next iteration depends on.
         iteration: Number of the next iteration.
     """
 
-    def __init__(self, method: PlannerConfig, start: CandidateStart) -> None:
-        self.method, self.start = method, start
+    def __init__(self, method: PlannerConfig, starts: ContactStarts, device: torch.device) -> None:
+        self.method, self._starts, self.device = method, starts, device
+        self.shape = starts.scene.horizon, starts.scene.action_dim
         self.memory: dict[str, Tensor] = {}
         self.iteration = 0
 
@@ -155,6 +131,19 @@ class Planner(ABC):
     def candidates(self) -> Tensor:
         """Return the last candidates, best first, shape [P, T, A]."""
 
+    def draw(self, count: int, random: torch.Generator) -> Tensor:
+        """Sample first candidates, shape [count, T, A]: contact starts first, then uniform ones."""
+        drawn = self.uniform(count, random)
+        if contacts := round(self.method.contact_starts * count):
+            seed = int(torch.randint(2**31, (1,), generator=random, device=self.device))
+            drawn[:contacts] = torch.as_tensor(self._starts.draw(contacts, seed)).to(drawn)
+        return drawn
+
+    def uniform(self, count: int, random: torch.Generator) -> Tensor:
+        """Sample numbers uniformly in +-``method.action_init``, shape [count, T, A]."""
+        unit = torch.rand((count, *self.shape), generator=random, dtype=torch.float64, device=self.device)
+        return (2.0 * unit - 1.0) * self.method.action_init
+
     def found(self) -> Tensor:
         """Return the best actions so far, followed by the last candidates, shape [1 + P, T, A]."""
         return torch.cat([self.memory["champion"][None], self.candidates()])
@@ -162,7 +151,7 @@ class Planner(ABC):
     def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
         """Make the next iteration; the first iteration may start from the result of the previous stage."""
         if self.iteration == 0:
-            nothing = torch.empty((0, *self.start.shape), dtype=torch.float64, device=self.start.device)
+            nothing = torch.empty((0, *self.shape), dtype=torch.float64, device=self.device)
             self.begin(random, nothing if found is None else found)
         shown = yield from self.iterate(random)
         self.iteration += 1
@@ -185,12 +174,12 @@ class Planner(ABC):
         """Restore a state returned by :meth:`state`."""
         self.iteration = int(state["iteration"])
         arrays = state.get("memory", {}).items()
-        self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
+        self.memory = {name: torch.as_tensor(array, device=self.device) for name, array in arrays}
 
 
-def make_planner(method: Any, start: CandidateStart) -> Any:
+def make_planner(method: Any, starts: ContactStarts, device: torch.device) -> Any:
     """Return the planner for a ``method`` section: a single planner or stages."""
-    return family(method.family).rules[method.algorithm].what(method, start)
+    return family(method.family).rules[method.algorithm].what(method, starts, device)
 
 
 @dataclass
@@ -229,8 +218,8 @@ class StagesConfig(MethodConfig):
 class Stages:
     """Planner that delegates to the planner of the current stage."""
 
-    def __init__(self, method: StagesConfig, start: CandidateStart) -> None:
-        self._methods, self._start = list(method.stages.values()), start
+    def __init__(self, method: StagesConfig, starts: ContactStarts, device: torch.device) -> None:
+        self._methods, self._starts, self._device = list(method.stages.values()), starts, device
         self._enter(0)
 
     def plan(self, random: torch.Generator) -> Asking:
@@ -249,7 +238,7 @@ class Stages:
 
     def _enter(self, stage: int) -> None:
         self._stage = stage
-        self._planner: Planner = make_planner(self._methods[stage], self._start)
+        self._planner: Planner = make_planner(self._methods[stage], self._starts, self._device)
 
 
 class PlannerRunner(Runner):
@@ -289,9 +278,11 @@ class PlannerRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Create the run's planner, or restore it from the file."""
+        from plab.runners.contact_starts import ContactStarts
+
         number, problem = track.number, self.problem
-        start = CandidateStart(problem.scenes[number], problem.target_mass[number], self._device)
-        planner = self._planners[number] = make_planner(track.cfg.method, start)
+        starts = ContactStarts(problem.scenes[number], problem.target_mass[number])
+        planner = self._planners[number] = make_planner(track.cfg.method, starts, self._device)
         if state is not None:
             planner.restore(state)
 

@@ -70,7 +70,7 @@ class Multistart(Planner):
     def begin(self, random: torch.Generator, found: Tensor) -> None:
         count = self.method.population
         kept = found[: count - round(self.method.fresh * count)]
-        places = torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]).clamp(-1.0, 1.0)
+        places = torch.cat([kept, self.draw(count - len(kept), random)]).clamp(-1.0, 1.0)
         moments = {name: torch.zeros_like(places) for name in ("mean", "square")}
         self.memory |= {"actions": places, "updates": places.new_zeros(count), **moments}
 
@@ -117,12 +117,9 @@ class Multistart(Planner):
     def _replace(self, order: Tensor, random: torch.Generator) -> None:
         """Replace the worse half of the candidates by new starts and by neighbours of better candidates."""
         better, worse = order.tensor_split([(len(order) + 1) // 2])
-        fresh = self.start.draw(self.method, round(self.method.fresh * len(worse)), random)
+        fresh = self.draw(round(self.method.fresh * len(worse)), random)
         beside = len(worse) - len(fresh)
-        unit = torch.rand(
-            (beside, *self.start.shape), generator=random, dtype=torch.float64, device=order.device
-        )
-        moved = self.memory["actions"][better[:beside]] + (2.0 * unit - 1.0) * self.method.action_init
+        moved = self.memory["actions"][better[:beside]] + self.uniform(beside, random)
         self.memory["actions"][worse] = torch.cat([moved, fresh]).clamp(-1.0, 1.0)
         for name in ("mean", "square", "updates"):
             self.memory[name][worse] = 0.0
@@ -167,12 +164,12 @@ class Sampler(Planner):
     @property
     def knots(self) -> int:
         """Number of points of a curve, at most one per step."""
-        return min(self.method.knots, self.start.shape[0])
+        return min(self.method.knots, self.shape[0])
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
         # Half of the candidates are the best so far; the others are new starts.
         kept = found[: self.method.population // 2]
-        drawn = self.start.draw(self.method, self.method.population - len(kept), random)
+        drawn = self.draw(self.method.population - len(kept), random)
         self.memory["candidates"] = torch.cat([kept, drawn])
 
     def candidates(self) -> Tensor:
@@ -186,7 +183,7 @@ class Sampler(Planner):
         else:
             points = self.sample(random).clamp(-1.0, 1.0)
             points[0] = self.memory["best"]
-        actions = actions_of(points, self.start.shape[0], method.curve)
+        actions = actions_of(points, self.shape[0], method.curve)
         softness = method.softness if method.contact == "soft" else None
         answer = yield Request(actions, softness)
         cost = answer.cost(method.objective)
@@ -216,8 +213,8 @@ class Sampler(Planner):
 
     def noise(self, random: torch.Generator) -> Tensor:
         """Sample standard normal numbers, shape [P, K, A]."""
-        size = (self.method.population, self.knots, self.start.shape[1])
-        return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
+        size = (self.method.population, self.knots, self.shape[1])
+        return torch.randn(size, generator=random, dtype=torch.float64, device=self.device)
 
 
 @dataclass
@@ -312,9 +309,9 @@ class Cmaes(Sampler):
 
     def sample(self, random: torch.Generator) -> Tensor:
         # The library has its own generator, seeded per iteration.
-        self._search.reseed_rng(int(torch.randint(2**31, (1,), generator=random, device=self.start.device)))
+        self._search.reseed_rng(int(torch.randint(2**31, (1,), generator=random, device=self.device)))
         drawn = np.stack([self._search.ask() for _ in range(self.method.population)])
-        return torch.as_tensor(drawn, device=self.start.device).reshape(-1, self.knots, self.start.shape[1])
+        return torch.as_tensor(drawn, device=self.device).reshape(-1, self.knots, self.shape[1])
 
     def learn(self, points: Tensor, cost: Tensor) -> None:
         pairs = zip(points.flatten(1).cpu().numpy(), cost.tolist(), strict=True)
