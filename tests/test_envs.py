@@ -155,6 +155,7 @@ def test_pictures(env: PlabEnv, vector: PlabVectorEnv, monkeypatch: pytest.Monke
     assert all(map(np.array_equal, drawn.frame.call_args.args, (state.x[0], state.poses[0])))
     # Puts back what closing takes away: the other tests go on with this environment.
     monkeypatch.setattr(env.batch, "_problem", env.batch.problem)
+    monkeypatch.setattr(env.batch._sensors, "_sources", env.batch._sensors._sources)
     env.close()
     drawn.close.assert_called_once()
     assert len(PlabVecEnv(vector.batch, render_mode="rgb_array").get_images()) == 2

@@ -21,7 +21,7 @@ from gymnasium.error import ResetNeeded
 from plab.config import Config, load_config, ranges
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
-from plab.envs.observations import Array, Observer, Sensors, mapped, spaces
+from plab.envs.observations import Array, Sensors, mapped, spaces
 from plab.envs.randomization import EpisodeRandomizer
 from plab.errors import ArgumentError
 from plab.objective import earth_movers_distances
@@ -115,8 +115,8 @@ def compose_configs(
 
 def check_render_mode(render_mode: str | None) -> str | None:
     """Return a valid render mode, or raise ValueError."""
-    if render_mode not in (None, *METADATA["render_modes"]):
-        raise ArgumentError(f"render_mode '{render_mode}' must be rgb_array or None")
+    if render_mode is not None:
+        ranges.one_of("render_mode", render_mode, METADATA["render_modes"])
     return render_mode
 
 
@@ -250,8 +250,7 @@ class EpisodeBatch:
         self._take(cfgs, problem)
         state_space, self.action_space = spaces(cfgs[0], [*self.problem.scenes, *self.randomizer.scenes])
         cameras = (cfgs[0].task.cameras or None) if cameras is None else cameras
-        points = min(cfgs[0].observe_particles, problem.simulator.particle_count)
-        self._sensors = Sensors(observe, cameras, problem.simulator, state_space, points)
+        self._sensors = Sensors(observe, cameras, problem.simulator, state_space, cfgs[0])
         self.observation_space = self._sensors.space
         self._begin()
 
@@ -337,10 +336,9 @@ class EpisodeBatch:
     def _refresh_views(self) -> None:
         """Update observations and pictures after changes of scenes and targets."""
         self._close_renderers()
-        self._sensors.refresh()
         # Changes by the caller invalidate the observations of random scenes.
         known = dict if self.changed_by_hand else self.randomizer.target_observations
-        self._observer = Observer(self.problem, self.configs[0], known)
+        self._sensors.refresh(self.problem, known)
 
     def _follow_changes(self, *, keep: bool) -> None:
         """Begin again if the caller has changed scenes, targets or initial states; ``keep`` the episodes."""
@@ -430,9 +428,13 @@ class EpisodeBatch:
         for table, old in zip(self._last, before, strict=True) if kept else ():
             mapped(lambda new, known: _set_rows(new, kept, known[kept]), table, old)
 
-    def require_running(self, idle: np.ndarray | bool = False) -> None:
-        """Raise ResetNeeded if an episode has ended or diverged, except ``idle`` ones."""
-        if np.any(self.over & ~np.asarray(idle)):
+    def require_running(
+        self, idle: np.ndarray | bool = False, *, steps: int = 1, frozen: bool = False
+    ) -> None:
+        """Raise ResetNeeded if an episode has fewer steps left or, unless ``frozen``, has diverged, except
+        ``idle`` ones."""
+        over = self._over | (self._steps + steps > self.horizon) | (not frozen and self.over)
+        if np.any(over & ~np.asarray(idle)):
             raise ResetNeeded("the episode is over or has not started: call reset() before step()")
 
     @_alone
@@ -453,10 +455,11 @@ class EpisodeBatch:
             gymnasium.error.ResetNeeded: If no episode has been started, or an episode has ended.
             plab.sim.SimulationError: If a simulation diverges and ``strict`` is True.
         """
-        simulator, steps = self._simulator, self._taken(idle=idle)
+        simulator = self._simulator
+        self.require_running(idle, frozen=True)
         # The measures report divergence, too; checking here would wait for the device twice.
         simulator.step(actions, check=False)
-        self._steps = steps + 1
+        self._steps = self._steps + 1
         # Queued before the wait for the measures.
         observation = self._observe(actions)
         try:
@@ -562,28 +565,22 @@ class EpisodeBatch:
             gymnasium.error.ResetNeeded: If the episodes have fewer steps left; other errors are those of the
                 simulator.
         """
-        taken = self._taken(steps)
+        self.require_running(steps=steps, frozen=True)
+        taken, observer = self._steps, self._sensors.observer
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
-            seen = self._observer(particles, poses)
+            seen = observer(particles, poses)
             return choose(t, self._noisy(seen, taken + t))
 
         def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
             bar = react(t, actions_bar)
-            return None if bar is None else self._observer.pull_back(bar)
+            return None if bar is None else observer.pull_back(bar)
 
         terms = self._simulator.closed_loop(
-            steps, chosen, reaction, stride=self._observer.stride, discount=discount, like=like
+            steps, chosen, reaction, stride=observer.stride, discount=discount, like=like
         )
         self._steps = taken + steps
         return terms
-
-    def _taken(self, steps: int = 1, idle: np.ndarray | bool = False) -> np.ndarray:
-        """Return the steps taken, shape [batch]; raise ResetNeeded if an episode has fewer left."""
-        over = self._over | (self._steps + steps > self.horizon)
-        if np.any(over & ~np.asarray(idle)):
-            raise ResetNeeded("the episode is over or has not started: call reset() before step()")
-        return self._steps
 
     @_alone
     def frames(self) -> tuple[np.ndarray, ...]:
@@ -611,11 +608,7 @@ class EpisodeBatch:
         self._renderers = []
 
     def _observe(self, like: Array = None) -> Any:
-        def state(like: Array) -> Array:
-            particles = self._simulator.observe(self._observer.stride, like)
-            return self._observer(particles, self._simulator.poses(like))
-
-        return self._noisy(self._sensors(state, like), self._steps)
+        return self._noisy(self._sensors(like), self._steps)
 
     def _noisy(self, observation: Any, steps: np.ndarray) -> Any:
         """Add the sampled noise to observations."""
@@ -625,7 +618,7 @@ class EpisodeBatch:
             np.random.default_rng([*seed, int(episode), int(step), 1])
             for seed, episode, step in zip(self._seeds, self._episodes, steps, strict=True)
         ]
-        return self._sensors.noisy(observation, deviations, rngs, self._observer.constant)
+        return self._sensors.noisy(observation, deviations, rngs)
 
     def _measured(self, like: Array = None) -> tuple[Array, ...]:
         """Return loss terms, IoU and, by name, requested measures of the current states."""

@@ -140,8 +140,11 @@ class Sensors:
 
     Attributes:
         names: Names of the observations, from :data:`OBSERVATIONS`.
+        observer: Observer of ``state``; set by :meth:`refresh`.
         space: Space of one environment's observation: a Box for a single observation, or a Dict.
     """
+
+    observer: Observer
 
     def __init__(
         self,
@@ -149,7 +152,7 @@ class Sensors:
         cameras: Mapping[str, Camera | Mapping[str, Any]] | None,
         simulator: Simulator,
         state_space: Box,
-        points: int,
+        cfg: Config,
     ) -> None:
         """Select the observations.
 
@@ -159,7 +162,7 @@ class Sensors:
                 observed.
             simulator: Simulator whose state is observed.
             state_space: Space of ``state``.
-            points: Number of ``points``.
+            cfg: Configuration with the entries of ``state`` and the number of ``points``.
 
         Raises:
             ValueError: If an observation does not exist, or there is nothing to observe.
@@ -179,12 +182,16 @@ class Sensors:
         self._cameras = {name: CameraSensor(simulator, one) for name, one in self.cameras.items() if looking}
         sensors = list(self._cameras.values())
         force = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
+        self._cfg, points = cfg, min(cfg.observe_particles, simulator.particle_count)
+
+        def state(like: Array) -> Array:
+            return self.observer(simulator.observe(self.observer.stride, like), simulator.poses(like))
 
         def positions(like: Array) -> Array:
             return simulator.observe(1, like)[..., :3]
 
-        sources: dict[str, tuple[Space[Any], Callable[[Array], Array] | None]] = {
-            "state": (state_space, None),
+        sources: dict[str, tuple[Space[Any], Callable[[Array], Array]]] = {
+            "state": (state_space, state),
             "particles": (_unit(simulator.particle_count, 3), positions),
             "mass": (_unit(CELLS, CELLS, CELLS), lambda like: _shares(positions(like))),
             "impulses": (force, simulator.impulses),
@@ -207,30 +214,28 @@ class Sensors:
 
     def release(self) -> None:
         """Release the simulator and its memory."""
-        self._sources, self._cameras = dict.fromkeys({"state"} & self._sources.keys()), {}
+        self._sources, self._cameras = {}, {}
 
-    def refresh(self) -> None:
-        """Update after a change of the simulator's scenes."""
+    def refresh(self, problem: Problem, known: Callable[[], Mapping[int, np.ndarray]]) -> None:
+        """Update after a change of scenes and targets; arguments are those of :class:`Observer`."""
+        self.observer = Observer(problem, self._cfg, known)
         for sensor in self._cameras.values():
             sensor.refresh()
 
-    def __call__(self, state: Callable[[Array], Array], like: Array) -> Any:
-        """Return observations of the current states; ``state`` is a function that returns the observation of
-        that name. If ``like`` is a CUDA tensor, so are the results."""
+    def __call__(self, like: Array) -> Any:
+        """Return observations of the current states. If ``like`` is a CUDA tensor, so are the results."""
         out = {}
         for name, source in self._sources.items():
-            values = (source or state)(like)
+            values = source(like)
             out[name] = values.float() if on_device(values) else values.astype(np.float32)
         for name, sensor in self._cameras.items() if self._pictures else ():
             for picture, values in sensor.capture(*self._pictures, like=like).items():
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
         return next(iter(out.values())) if self._alone else out
 
-    def noisy(
-        self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator], constant: int
-    ) -> Any:
-        """Return observations of a batch with Gaussian noise, clipped to their space. Colours, labels and the
-        last ``constant`` entries of ``state`` have no noise.
+    def noisy(self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator]) -> Any:
+        """Return observations of a batch with Gaussian noise, clipped to their space. Colours, labels and
+        constant entries of ``state`` have no noise.
 
         ``deviations`` are standard deviations, shape [batch]; ``rngs`` are one generator per environment.
         """
@@ -240,7 +245,7 @@ class Sensors:
                 return values
             noise = np.stack([rng.standard_normal(space.shape, np.float32) for rng in rngs])
             noise *= deviations.astype(np.float32).reshape(-1, *[1] * len(space.shape))
-            if name == "state" and constant:
+            if name == "state" and (constant := self.observer.constant):
                 noise[:, -constant:] = 0.0
             if name == "points":
                 noise[..., 3:] = 0.0

@@ -120,8 +120,9 @@ class IdentifyRunner(Runner):
         from plab.envs.observations import Sensors
 
         environment = json.loads(metadata_of(self.method.dataset).get("env_spec", "{}"))
-        given = environment.get("kwargs", {}).get("cameras") or self.tracks[0].cfg.task.cameras or None
-        sensors = Sensors(["depth"], given, self.problem.simulator, Box(0.0, 1.0, (1,)), 1)
+        cfg = self.tracks[0].cfg
+        given = environment.get("kwargs", {}).get("cameras") or cfg.task.cameras or None
+        sensors = Sensors(["depth"], given, self.problem.simulator, Box(0.0, 1.0, (1,)), cfg)
         names = {f"{name}_depth": camera for name, camera in sensors.cameras.items()}
         if not isinstance(seen, dict):
             seen = dict.fromkeys(names, seen) if len(names) == 1 else {}
@@ -131,7 +132,7 @@ class IdentifyRunner(Runner):
         def depths(pictures: Any) -> np.ndarray:
             return np.concatenate([_block_depths(pictures[name], one) for name, one in names.items()], -1)
 
-        self._look = lambda: depths(sensors(lambda like: like, self._actions))
+        self._look = lambda: depths(sensors(self._actions))
         return depths(seen)[1:]
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
@@ -238,6 +239,5 @@ FAMILY = Family(
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
     may_be_nan=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
-    contact="hard",
     methods={"identify": Appearance("Identify", "#555555", ":")},
 )
