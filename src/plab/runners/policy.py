@@ -22,10 +22,10 @@ from omegaconf import OmegaConf
 
 from plab.config import MethodConfig, ranges
 from plab.config.families import family, known_family
-from plab.files import one_line, read_arrays
+from plab.files import read_arrays
 from plab.plugins import torch
 from plab.results import ResultsError
-from plab.results.run_file import replace_file
+from plab.results.run_file import explained, replace_file
 from plab.scenes import DEVICES
 
 if TYPE_CHECKING:
@@ -191,16 +191,11 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
             not been imported.
     """
     path = policy_path(Path(result))
-    try:
-        policy = _policy(path)
-    except FileNotFoundError:
+    if not path.exists():
         why = "sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
-        raise ResultsError(f"{path} does not exist: {why}") from None
-    except ResultsError:
-        raise
-    except Exception as error:
-        why = f"is not a plab policy ({one_line(error)}): run it again with force=true"
-        raise ResultsError(f"{path} {why}") from error
+        raise ResultsError(f"{path} does not exist: {why}")
+    with explained(path):
+        policy = _policy(path)
     # Errors of the device do not concern the file.
     policy.network = policy.network.to(device)
     return policy
