@@ -6,6 +6,7 @@ With ``sim.device=cuda`` tensors stay on the device.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -15,7 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch
-from plab.envs.tensors import floating
+from plab.envs.tensors import floating, simulator_input
 from plab.sim.state import require_none
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
 class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, problem: Problem, gradient: bool) -> torch.Tensor:
-        result = problem.evaluate_actions(_given(actions, problem.simulator), gradient=gradient)
+        result = problem.evaluate_actions(simulator_input(actions, problem.simulator), gradient=gradient)
         require_none(result.failures)
         if gradient:
             ctx.save_for_backward(torch.as_tensor(result.gradient).to(actions))
@@ -62,11 +63,6 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
         return loss_bar[:, None, None] * gradient, None, None
-
-
-def _given(tensor: torch.Tensor, simulator: Simulator) -> Any:
-    """Return a tensor as input for the simulator: unchanged on its CUDA device, otherwise as an array."""
-    return tensor.detach() if tensor.is_cuda and simulator.device == "cuda" else _numbers(tensor)
 
 
 def _numbers(tensor: torch.Tensor) -> np.ndarray:
@@ -153,7 +149,7 @@ class _States(torch.autograd.Function):
         if parts:
             simulator.reset()
             simulator.set_initial_state(replace(simulator.state(), **parts))
-        given = _given(actions, simulator)
+        given = simulator_input(actions, simulator)
         recording = simulator.record(given, every_step=every_step, mass=mass, gradient=gradient)
         ctx.simulator, ctx.recording = simulator, recording
         ctx.likes = actions, material, *initial
@@ -167,7 +163,7 @@ class _States(torch.autograd.Function):
     def backward(ctx: Any, *bars: torch.Tensor | None) -> tuple[Any, ...]:
         recording: RecordedStates = ctx.recording
         held = {
-            name: _given(bar, ctx.simulator)
+            name: simulator_input(bar, ctx.simulator)
             for name, bar in zip(States._fields, bars, strict=True)
             if bar is not None and bar.numel()
         }
@@ -238,9 +234,7 @@ def policy_gradient(
     like = parameters[0].detach()
     seen: list[torch.Tensor] = []
     done: list[torch.Tensor] = []
-
-    def given(tensor: torch.Tensor) -> Any:
-        return tensor.detach() if like.is_cuda else tensor.detach().double().numpy()
+    given = functools.partial(simulator_input, simulator=batch.problem.simulator)
 
     def choose(t: int, observation: Any) -> Any:
         seen.append(torch.as_tensor(observation).to(like).requires_grad_())

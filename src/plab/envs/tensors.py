@@ -20,6 +20,13 @@ def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
     return actions if actions.is_floating_point() else actions.to(getattr(torch, simulator.precision))
 
 
+def simulator_input(tensor: torch.Tensor, simulator: Simulator) -> Any:
+    """Return a tensor as input for a simulator: unchanged on its CUDA device, otherwise a float64 array."""
+    if tensor.is_cuda and simulator.device == "cuda":
+        return tensor.detach()
+    return tensor.detach().cpu().double().numpy()
+
+
 class TensorEnv:
     """A batch of episodes with tensors as inputs and outputs.
 

@@ -113,13 +113,13 @@ class PodsRunner(ImitationRunner):
 
     def _improved(self, actions: torch.Tensor, rate: float) -> torch.Tensor:
         """Return actions, shape [env, T, A], improved by Adam along the gradient of the trajectory loss."""
+        from plab.envs.tensors import simulator_input
+
         plan = torch.nn.Parameter(actions.clone())
         optimizer = torch.optim.Adam([plan], lr=rate)
         for _ in range(self.method.updates):
-            given = plan.detach()
-            tried = self.batch.problem.evaluate_actions(
-                given if given.is_cuda else given.double().numpy(), gradient=True
-            )
+            given = simulator_input(plan, self.batch.problem.simulator)
+            tried = self.batch.problem.evaluate_actions(given, gradient=True)
             self._note_failures(tried.failures)
             plan.grad = torch.as_tensor(tried.gradient, dtype=plan.dtype, device=plan.device)
             # Diverged episodes have no gradient.
@@ -147,7 +147,6 @@ FAMILY = Family(
     columns=PodsRunner.columns,
     may_be_nan=PodsRunner.columns,
     rules={"pods": Rule(PodsRunner, PodsConfig)},
-    contact="hard",
     kind=GRADIENT,
     methods={"pods": Appearance("PODS", "#999933", "--")},
 )
