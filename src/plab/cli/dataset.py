@@ -204,16 +204,12 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
         filled = [part[k % len(part)] for k in range(batch.size)]
         batch.renew([one.cfg for one in filled])
         observation, info = batch.reset()
-        seen, infos, rewards, failures = [observation], [info], [], dict[int, str]()
         actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
         if actions.shape[1] != batch.horizon:
             raise DatasetError(f"actions of {actions.shape[1]} steps for sim.horizon={batch.horizon}")
-        for t in range(batch.horizon):
-            step = batch.step(actions[:, t], strict=False)
-            seen.append(step.observation)
-            infos.append(step.info)
-            rewards.append(step.reward)
-            failures = dict(step.failures)
+        steps = [batch.step(actions[:, t], strict=False) for t in range(batch.horizon)]
+        seen = [observation, *(step.observation for step in steps)]
+        infos, failures = [info, *(step.info for step in steps)], steps[-1].failures
         for e, one in enumerate(part):
             if e in failures:
                 print_error(f"{one.cfg.task.name}-v{one.cfg.variant}: left out: {failures[e]}")
@@ -225,7 +221,7 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
             yield Episode(
                 observations=mapped(lambda *rows, e=e: np.stack([row[e] for row in rows]), *seen),
                 actions=actions[e],
-                rewards=np.array([reward[e] for reward in rewards]),
+                rewards=np.array([step.reward[e] for step in steps]),
                 infos=measured | ({"randomized": sampled} if sampled else {}),
                 attributes=named | {"score": float(measured["score"][-1])},
             )
