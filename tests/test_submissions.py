@@ -54,9 +54,9 @@ from plab.submissions.verifying import (
 from synthetic_runs import synthetic_run, template
 
 ROOT = Path(__file__).resolve().parents[1]
-CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)
+CARD = Card("Mine", ["A. Author", "B. Author"], "https://example.org/mine", 10**9, "a laptop", False)
 why = functools.partial(refusals.why, ResultsError)
-GOOD = dataclasses.asdict(CARD) | {"authors": list(CARD.authors)}
+GOOD = dataclasses.asdict(CARD)
 CHECKSUM = "a" * 64
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
 

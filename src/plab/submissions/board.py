@@ -19,7 +19,7 @@ from plab.results import ResultsError
 from plab.submissions.submission import UNSEEN, Card, SubmissionError, read
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, configs_of, read_verification, submission_files
 
-PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
+PAPER = Card("", ["Huang et al."], "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
 _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 """Environment steps of the paper's methods, with and without gradient; its episodes have 50 steps."""
 

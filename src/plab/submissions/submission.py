@@ -69,7 +69,7 @@ class Card:
     """
 
     name: str
-    authors: tuple[str, ...]
+    authors: list[str]
     link: str
     budget: int
     hardware: str
@@ -221,7 +221,7 @@ def parse_card(text: bytes, source: str) -> Card:
         _require(link is not None, "link must be an address that begins with https:// or http://")
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise SubmissionError(f"{source}: {one_line(error)}") from None
-    return Card(**(record | {"authors": tuple(authors)}))
+    return Card(**record)
 
 
 def write(submission: Submission, path: Path) -> None:
@@ -240,7 +240,7 @@ def encode(submission: Submission) -> bytes:
     """Return the bytes of a submission file, with the version of this plab."""
     members: dict[str, bytes] = {}
     if submission.card is not None:
-        card = asdict(submission.card) | {"authors": list(submission.card.authors)}
+        card = asdict(submission.card)
         members[_CARD] = yaml.safe_dump(card, sort_keys=False, allow_unicode=True).encode()
     listed = []
     for number, entry in enumerate(submission.entries):
