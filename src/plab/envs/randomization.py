@@ -98,7 +98,7 @@ class EpisodeRandomizer:
         self._pools = {
             key: _pool(cfg, problem.simulator) for key, cfg in unique.items() if SCENES in cfg.task.randomize
         }
-        targets: list[list[Target]] = _stage_targets(cfgs, problem) if stages else []
+        targets = _stage_targets(cfgs, problem) if stages else []
         targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
         self.last_stage = len(targets) - 1
         by_environment = map(list, zip(*targets, strict=True))
@@ -269,7 +269,7 @@ def _stage_targets(cfgs: Sequence[Config], problem: Problem) -> list[list[Target
         raise ConfigError("task.stages differ in number between sub-environments")
     if any(cfg.task.stages and {SCENES, "target"} & set(cfg.task.randomize) for cfg in cfgs):
         raise ConfigError("task.randomize cannot have scenes or targets in a task with task.stages")
-    stages = []
+    stages: list[list[Target]] = []
     for number in range(len(cfgs[0].task.stages)):
         # Equal configurations share one object, and so do their targets.
         own = {id(c): replace(c, task=replace(c.task, target=c.task.stages[number])) for c in cfgs}
