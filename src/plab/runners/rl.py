@@ -10,6 +10,7 @@ deterministic policy, which produces a row of the results. To reproduce a result
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, Replay
 from plab.runners.policy import Policy, Spaces
 from plab.runners.ppo import PpoAgents, PpoConfig
 from plab.runners.runner import RunError
-from plab.runners.sac import SacAgents, SacConfig
+from plab.runners.sac import SacAgents
 from plab.runners.td3 import Td3Agents, Td3Config
 from plab.runners.training import PolicyRunner
 
@@ -167,11 +168,10 @@ FAMILY = Family(
     batching=True,
     in_step=True,
     rules={
-        "sac": Rule(SacAgents, SacConfig),
+        "sac": Rule(SacAgents, OffPolicyConfig),
         "td3": Rule(Td3Agents, Td3Config),
         "ppo": Rule(PpoAgents, PpoConfig),
     },
-    contact="hard",
     kind=RL,
     methods={
         "sac": Appearance("SAC", "#0072B2"),
@@ -180,12 +180,5 @@ FAMILY = Family(
     },
 )
 
-SB3 = Family(
-    config=RlConfig,
-    runner="plab.runners.sb3:Sb3Runner",
-    columns=FAMILY.columns,
-    may_be_nan=FAMILY.may_be_nan,
-    contact="hard",
-    kind=RL,
-)
+SB3 = replace(FAMILY, runner="plab.runners.sb3:Sb3Runner", batching=False, rules={}, methods={})
 """Template for records of external algorithms, which add their ``config`` and ``rules``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.plugins import torch
@@ -27,11 +26,6 @@ LOG_STD = -20.0, 2.0
 
 EPSILON = 1e-6
 """Added to 1 - a^2 in the density of actions a, as in Stable-Baselines3."""
-
-
-@dataclass
-class SacConfig(OffPolicyConfig):
-    """Soft actor-critic."""
 
 
 class SacAgents(OffPolicyAgents):
@@ -59,7 +53,7 @@ class SacAgents(OffPolicyAgents):
         self.optimizers = {name: adam(part, self.method.lr) for name, part in own.items()}
 
     @staticmethod
-    def make_policy(method: SacConfig, spaces: Spaces) -> Any:
+    def make_policy(method: OffPolicyConfig, spaces: Spaces) -> Any:
         """Return Stable-Baselines3's policy with Glorot uniform weights and zero biases."""
         from stable_baselines3.sac.policies import SACPolicy
 
