@@ -102,27 +102,22 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
 def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -> None:
     """Execute unfinished tracks of one family until each has finished or failed and released its lock."""
-    party = [track for track in tracks if track.open]
-    parties, cache = [party] if party else [], cache or SimulatorCache()
+    cache = cache or SimulatorCache()
+    # Executed alone, all together, or with those at the same iteration.
+    groups: dict[int, list[Track]] = defaultdict(list)
+    for number, track in enumerate(track for track in tracks if track.open):
+        own = family(track.cfg.method.family)
+        groups[number if not own.batching else track.iteration if own.in_step else 0].append(track)
+    parties = [groups[key] for key in sorted(groups)]
     try:
         while parties:
             party = parties.pop(0)
             try:
                 name = party[0].cfg.method.family
-                own = family(name)
-                kind = own.runner_type()
+                kind = family(name).runner_type()
                 if not issubclass(kind, Runner):
                     raise ConfigError(f"the runner of method.family '{name}' is not a plab.runners.Runner")
-                # Executed alone, all together, or with those at the same iteration.
-                groups: dict[int, list[Track]] = defaultdict(list)
-                for number, track in enumerate(party):
-                    groups[number if not own.batching else track.iteration if own.in_step else 0].append(
-                        track
-                    )
-                if len(groups) == 1:
-                    kind(party, note, cache).run()
-                else:
-                    parties[:0] = [groups[key] for key in sorted(groups)]
+                kind(party, note, cache).run()
             except TogetherError:
                 left = [track for track in party if track.open]
                 half = len(left) if len(left) < len(party) else len(left) // 2
