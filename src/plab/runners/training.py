@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
-from plab.config import Config, ConfigError, ranges
+from plab.config import Config, ConfigError, build_scene, ranges
 from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
 from plab.plugins import torch
@@ -92,14 +92,11 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
     model, reused from the last run if compatible."""
 
     # Imported here, because it imports the simulator.
-    from plab.config import build_scene
     from plab.envs.core import EpisodeBatch
 
     def start_again(batches: list[EpisodeBatch]) -> None:
-        for batch, (cfgs, contact) in zip(batches, kinds, strict=True):
+        for batch, (cfgs, _) in zip(batches, kinds, strict=True):
             batch.renew(cfgs)
-            batch.reset()
-            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
 
     key: list[Hashable] = []
     for cfgs, contact in kinds:
