@@ -78,8 +78,6 @@ class ImitationRunner(ActorRunner):
 class BcRunner(ImitationRunner):
     """Runner of a policy trained on a dataset; a cycle is one pass."""
 
-    columns = ("imitation_error",)
-
     def prepare(self, batch: EpisodeBatch) -> None:
         """Load the observations and actions of the dataset."""
         super().prepare(batch)
@@ -128,8 +126,8 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
 FAMILY = Family(
     config=BcConfig,
     runner=BcRunner,
-    columns=BcRunner.columns,
-    may_be_nan=BcRunner.columns,
+    columns=("imitation_error",),
+    may_be_nan=("imitation_error",),
     ranking="score",
     rules={"bc": Rule(BcRunner, BcConfig)},
     contact="hard",

@@ -56,8 +56,6 @@ class PodsConfig(ActorConfig):
 class PodsRunner(ImitationRunner):
     """Runner of a policy and its rounds of training episodes."""
 
-    columns = ("train_reward", "train_score", "plan_reward", "plan_score")
-
     def prepare(self, batch: EpisodeBatch) -> None:
         # Episodes of the policy, with gradient, and with the improved actions.
         self.round_episodes = self.method.updates + 2, self.method.updates
@@ -141,11 +139,13 @@ class PodsRunner(ImitationRunner):
         self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in state["rounds"]]
 
 
+_COLUMNS = ("train_reward", "train_score", "plan_reward", "plan_score")
+
 FAMILY = Family(
     config=PodsConfig,
     runner=PodsRunner,
-    columns=PodsRunner.columns,
-    may_be_nan=PodsRunner.columns,
+    columns=_COLUMNS,
+    may_be_nan=_COLUMNS,
     rules={"pods": Rule(PodsRunner, PodsConfig)},
     kind=GRADIENT,
     methods={"pods": Appearance("PODS", "#999933", "--")},

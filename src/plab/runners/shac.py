@@ -156,8 +156,8 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 FAMILY = Family(
     config=ShacConfig,
     runner=ShacRunner,
-    columns=ShacRunner.columns,
-    may_be_nan=ShacRunner.columns,
+    columns=("train_reward", "train_score"),
+    may_be_nan=("train_reward", "train_score"),
     rules={"shac": Rule(ShacRunner, ShacConfig)},
     contact="hard",
     kind=GRADIENT,

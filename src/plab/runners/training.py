@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -121,13 +121,11 @@ class PolicyRunner(Runner, ABC):
         batch: Environments of the training.
         total_steps: Total number of transitions per policy, in whole cycles.
         simulates: Whether there are training environments.
-        measured: Values of each policy's finished episodes since its last evaluation, by column.
+        measured: Values of each policy's finished episodes since its last evaluation, by column of results;
+            the rows have their means, or NaN if no episode has finished.
         broken: Times and reasons of their divergence; diverged environments are frozen until their episode
             ends.
     """
-
-    columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
-    """Measures of training episodes; the rows have their means, or NaN if no episode has finished."""
 
     round_episodes: tuple[int, int] = 1, 0
     """Episodes per environment in a cycle, and episodes with gradient."""
@@ -250,6 +248,7 @@ class PolicyRunner(Runner, ABC):
             self.train(int(last) + self.method.evaluate_every)
             self.enter("evaluate")
         measures, actions, failures = evaluate(self._judge, self.decide)
+        columns = self._family.columns
         losses, states = self.losses(), self.states()
         every, differentiated = self.round_episodes
         simulated = self.steps - before if self.simulates else 0
@@ -258,11 +257,11 @@ class PolicyRunner(Runner, ABC):
             measured, broken, failure = self.measured[k], self.broken[k], failures.get(k, "")
             self.measured[k], self.broken[k] = {}, []
             # A value stands for all episodes of an environment in a round.
-            ended = every * len(measured.get(self.columns[0], ()))
+            ended = every * len(measured.get(columns[0], ()))
             if why := _unusable(track, broken, ended, actions[k], failure):
                 track.fail(why)
                 continue
-            means = {name: float(np.mean(measured.get(name, np.nan))) for name in self.columns}
+            means = {name: float(np.mean(measured.get(name, np.nan))) for name in columns}
             with track.results_errors():
                 if found := self.replay(track.number):
                     found[0].write(found[1], _replay_path(track))
@@ -284,9 +283,6 @@ class PolicyRunner(Runner, ABC):
     def extent(self) -> tuple[int, int, int]:
         """Return the numbers of finished and total episodes, and of episodes between evaluations."""
         return self.episodes, self.total_steps // self._horizon, self.method.evaluate_every
-
-    def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
-        return f"reward {means['reward']:.4g} hard score {means['score']:.3f}"
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
