@@ -14,12 +14,12 @@ from pages import ROOT, blocks
 from plab.cli.run import main
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.files import ShapeError
+from plab.mesh import load_mesh
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.render.graphics import RenderError
 from plab.render.rollouts import stored
 from plab.results import config_dict, load
 from plab.scenes import Body, Scene, make_body, sample_particles
-from plab.scenes.mesh import load_mesh
 from plab.targets import TargetError, build_target
 from plab.targets.recipes import read_points
 from refusals import why

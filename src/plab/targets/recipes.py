@@ -251,7 +251,7 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
     ShapeError if the file cannot be read or contains no points."""
     kind = Path(file).suffix.lower()
     if kind == ".ply":
-        from plab.scenes.mesh import read_mesh
+        from plab.mesh import read_mesh
 
         points = np.asarray(read_mesh(file).vertices, np.float64)
     elif kind == ".xyz":
