@@ -70,9 +70,9 @@ class Tape:
         return self._history[number], step * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
-        """Return the number of environment steps per segment for a gradient over T ``steps``: the largest
-        that fits into a budget for everything that the simulator holds [MB], reduced to segments of about
-        equal length.
+        """Return the number of environment steps per segment for a gradient over T ``steps``: as few segments
+        of about equal length as fit into a budget for everything that the simulator holds [MB], because
+        their steps are recomputed.
 
         Raises:
             MemoryError: If no length fits into the budget or into arrays that Taichi can address.
@@ -86,24 +86,23 @@ class Tape:
         if engine.sorts:
             # The orders of all steps, and the adjoint's other half.
             held += 4 * steps * particles.places + particles.slot_bytes
-        segments_max = ENTRIES_MAX[engine.device] // particles.slot_entries
-        lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
+        most = min(steps, ENTRIES_MAX[engine.device] // particles.slot_entries) if reach else 0
+        lengths = [-(-steps // segments) for segments in range(1, most + 1)]
         if not lengths:
             raise MemoryError(
                 f"a gradient of {steps} steps has more numbers than Taichi can address: "
                 "simulate fewer environments together, or fewer steps"
             )
-        slots = {n: kept_states(steps, self._slots_per_step, n, reach) for n in lengths}
-        cost = {n: count * particles.slot_bytes + held for n, count in slots.items()}
-        fitting = [n for n in lengths if cost[n] <= memory_mb * 1e6]
-        if not fitting:
-            need = math.ceil(min(cost.values()) / 1e6)
+        slots = [kept_states(steps, self._slots_per_step, length, reach) for length in lengths]
+        cost = [count * particles.slot_bytes + held for count in slots]
+        if min(cost) > memory_mb * 1e6:
+            need = math.ceil(min(cost) / 1e6)
             raise MemoryError(
                 f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
                 f"set sim.memory_mb={need} or more"
             )
-        # As few segments as possible, because their steps are recomputed.
-        length = self._plans[steps, memory_mb] = -(-steps // -(-steps // max(fitting)))
+        fitting = (n for n, needed in zip(lengths, cost, strict=True) if needed <= memory_mb * 1e6)
+        length = self._plans[steps, memory_mb] = next(fitting)
         return length
 
     def _allocate(self, steps: int) -> None:
