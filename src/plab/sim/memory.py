@@ -59,17 +59,13 @@ def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None
     number that fits."""
     count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
     numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
-    if not numbered:
-        raise SceneError(f"a grid of {n}^3 nodes exceeds the range of indices: use fewer nodes")
-    if one > room:
-        raise SceneError(
-            f"the scene needs at least {one / 1e9:.3g} GB, but only {room / 1e9:.3g} GB are available: "
-            "use fewer particles, grid nodes or substeps"
-        )
     if count > numbered or count * one > room:
+        fitting = int(min(numbered, room // one))
+        together = f"simulate at most {fitting} together"
         raise SceneError(
-            f"{count} environments of {n}^3 nodes need at least {count * one / 1e9:.3g} GB, but only "
-            f"{room / 1e9:.3g} GB are available: simulate at most {min(numbered, int(room // one))} together"
+            f"{count} environments of {n}^3 nodes, at least {count * one / 1e9:.3g} GB, exceed the range of "
+            f"indices or the memory, {room / 1e9:.3g} GB: "
+            f"{together if fitting else 'use fewer particles, grid nodes or substeps'}"
         )
 
 
