@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from plab.kinematics.chain import Chain
     from plab.scenes import Scene
 
-__all__ = ["JointActions", "LinkMotion"]
-
 
 class LinkMotion:
     """Motion of the links in some environment steps, with its pullback.

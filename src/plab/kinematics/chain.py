@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike
 
 from plab.errors import PlabError
 
-__all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "ModelError", "matched", "pose_matrix"]
-
 Matrix = tuple[tuple[float, ...], ...]
 """Homogeneous transform, 4 rows of 4 numbers."""
 

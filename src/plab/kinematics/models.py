@@ -14,8 +14,6 @@ import numpy as np
 from plab.files import pinned
 from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, ModelError, matched, pose_matrix
 
-__all__ = ["locate_model", "read_model"]
-
 CAPSULE_RATIO = 1.5
 """Largest ratio of the shorter edges of a mesh's oriented bounding box for fitting a capsule; otherwise the
 box is used."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from plab.sim.simulator import Simulator
 
-__all__ = ["BACKGROUND", "FIRST_BODY", "FIRST_MANIPULATOR", "FLOOR", "CameraSensor"]
-
 BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
 """Segmentation labels; manipulators and bodies are numbered from the last two on."""
 
