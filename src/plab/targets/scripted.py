@@ -63,12 +63,6 @@ class ActionTrack:
         """Delay the whole motion so that it ends with the episode."""
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
-    def actions(self) -> np.ndarray:
-        """Return the actions of an episode, shape [EPISODE_STEPS, A]; raise _TooLong if they exceed it."""
-        if len(self) > EPISODE_STEPS:
-            raise _TooLong
-        return self.first(EPISODE_STEPS)
-
     def first(self, steps: int) -> np.ndarray:
         """Return the actions of the first ``steps`` steps, shape [steps, A]."""
         self.wait(steps)
@@ -118,7 +112,9 @@ class Script(Recipe):
         if not tracks:
             raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
         self.plan(scene, tracks, rng)
-        return np.concatenate([track.actions() for track in tracks], axis=1)
+        if max(map(len, tracks)) > EPISODE_STEPS:
+            raise _TooLong
+        return np.concatenate([track.first(EPISODE_STEPS) for track in tracks], axis=1)
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """Sample one path for each moving manipulator."""
