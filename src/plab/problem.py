@@ -297,16 +297,15 @@ class Problem:
     def evaluate_actions(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
         """Return the measures of episodes simulated as in :meth:`rollout`, without an error for divergence.
         CUDA tensors stay on the device, except failures."""
-        result = self.simulator.rollout(actions, gradient=gradient, strict=False)
-        terms, iou = result.step_terms, result.step_iou[:, -1]
-        loss = self.loss_of(terms)
-        reward = self.loss_of(result.initial_terms)[:, None] - loss
+        episodes = self.rollout(actions, gradient=gradient, strict=False, exact=False)
+        loss, iou = episodes.loss, episodes.iou[:, -1]
         score, _ = self.scores_of(iou)
         # cumsum() adds in order, while the order of sum() depends on the number of episodes.
-        total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
+        tables = loss, episodes.terms, episodes.reward
+        total, summed, reward = (values.cumsum(1)[:, -1] for values in tables)
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
-        return BatchMeasures(measures | {"final_loss": loss[:, -1]}, result.gradient, result.failures)
+        return BatchMeasures(measures | {"final_loss": loss[:, -1]}, episodes.gradient, episodes.failures)
 
     def iou_gradient(self, actions: torch.Tensor) -> tuple[torch.Tensor, dict[int, str]]:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
@@ -346,7 +345,7 @@ class Problem:
         return torch.as_tensor(known[1].like(mass))
 
     def rollout(
-        self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True
+        self, actions: np.ndarray | torch.Tensor, *, gradient: bool, strict: bool = True, exact: bool = True
     ) -> Episodes:
         """Simulate actions from the initial states, in the simulator's current contact model.
 
