@@ -46,8 +46,9 @@ def environment_bytes(
     return numbers * BYTES[precision] + counts + 64 * frames
 
 
-def _chunks(device: str) -> int:
-    return CHUNKS if device == "cpu" else 1
+def _numbered(scene: Scene, device: str) -> int:
+    """Largest number of environments whose grid nodes can be numbered."""
+    return INDEX_MASK // ((CHUNKS if device == "cpu" else 1) * _nodes(scene))
 
 
 def _nodes(scene: Scene) -> int:
@@ -58,7 +59,7 @@ def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None
     """Raise SceneError unless scenes of equal size fit into one simulator; the message states the largest
     number that fits."""
     count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
-    numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
+    numbered, n = _numbered(scenes[0], device), scenes[0].grid_size
     if count > numbered or count * one > room:
         fitting = int(min(numbered, room // one))
         together = f"simulate at most {fitting} together"
@@ -112,11 +113,8 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     # states.
     one = environment_bytes(scene, precision, device, states=kept + 7, gradient=True)
     entries = -(-scene.particle_count // LANES[device]) * LANES[device] * STATE
-    numbered = (
-        ENTRIES_MAX[device] // ((slots_per_step + 1) * entries),
-        INDEX_MASK // (_chunks(device) * _nodes(scene)),
-    )
-    return max(1, min(int(memory_mb * 1e6 / one), *numbered))
+    stored = ENTRIES_MAX[device] // ((slots_per_step + 1) * entries)
+    return max(1, min(int(memory_mb * 1e6 / one), stored, _numbered(scene, device)))
 
 
 def held_bytes(*holders: object) -> int:
