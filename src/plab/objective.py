@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError, ConfigError, suggest
+from plab.plugins import scipy
 
 TARGET_ENTRIES = 14
 """Length of :func:`target_observation`."""
@@ -99,16 +100,13 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") 
 def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     """Return the distance of every grid node to the nearest node of the target [domain units], shape [n, n,
     n]. Nodes with a mass above ``threshold`` belong to the target; raise ValueError if there are none."""
-    # Imported here, because SciPy would slow down every `--help`.
-    from scipy.ndimage import distance_transform_edt
-
     mass = np.asarray(mass, dtype=np.float64)
     outside = ~(mass > threshold)
     if outside.all():
         raise ArgumentError(
             f"the target is empty: its largest node mass is {mass.max():.3g}, at most {threshold:g}"
         )
-    return distance_transform_edt(outside) / mass.shape[0]
+    return scipy.ndimage.distance_transform_edt(outside) / mass.shape[0]
 
 
 def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
@@ -154,12 +152,9 @@ def earth_movers_distance(a: ArrayLike, b: ArrayLike) -> float:
     Both tensors are divided into portions of equal mass, of neighbouring nodes along a space-filling curve,
     which are matched optimally. For shapes far apart the result is exact up to the size of a portion.
     """
-    # Imported here, because SciPy would slow down every `--help`.
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist
-
-    distances = cdist(mass_portions(a, TRANSPORT_PORTIONS), mass_portions(b, TRANSPORT_PORTIONS))
-    return float(distances[linear_sum_assignment(distances)].mean())
+    x, y = (mass_portions(mass, TRANSPORT_PORTIONS) for mass in (a, b))
+    distances = scipy.spatial.distance.cdist(x, y)
+    return float(distances[scipy.optimize.linear_sum_assignment(distances)].mean())
 
 
 def earth_movers_distances(a: Iterable[ArrayLike], b: Iterable[ArrayLike], like: Any) -> Any:
@@ -257,11 +252,8 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
 def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return missing (positive) and excess (negative) mass per node as fractions of the total mass, shape [n,
     n, n]. Both mass tensors are normalised and smoothed, because particles are sampled at random."""
-    # Imported here, because SciPy would slow down every `--help`.
-    from scipy.ndimage import gaussian_filter
-
     change = target / target.sum() - start / start.sum()
-    return gaussian_filter(change, SMOOTHING * len(target), mode="constant")
+    return scipy.ndimage.gaussian_filter(change, SMOOTHING * len(target), mode="constant")
 
 
 def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:

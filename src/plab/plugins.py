@@ -33,9 +33,10 @@ class LazyModule(ModuleType):
 
 if TYPE_CHECKING:
     import pandas
+    import scipy
     import torch
 else:
-    pandas, torch = LazyModule("pandas"), LazyModule("torch")
+    pandas, scipy, torch = map(LazyModule, ("pandas", "scipy", "torch"))
 
 
 class Registry(UserDict[str, Any]):

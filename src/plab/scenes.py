@@ -16,7 +16,7 @@ import numpy as np
 
 from plab.errors import PlabError
 from plab.laws import Law
-from plab.plugins import Registry
+from plab.plugins import Registry, scipy
 
 if TYPE_CHECKING:
     from plab.kinematics import Chain
@@ -591,10 +591,8 @@ def _require(condition: bool, message: str) -> None:
 
 def link_manipulators(chain: Chain, friction: float) -> tuple[Manipulator, ...]:
     """Return the links of an articulated model as manipulators with their poses at t = 0."""
-    from scipy.spatial.transform import Rotation
-
     frames = chain.frames([joint.start for joint in chain.joints])
-    turns = Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
+    turns = scipy.spatial.transform.Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
     wide: dict[str, Any] = {"lower_bound": (-1.0,) * 3, "upper_bound": (2.0,) * 3}
     return tuple(
         Manipulator(k.shape, k.size, vector3(at.tolist()), tuple(q.tolist()), friction=friction, **wide)

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import PlabError
+from plab.plugins import scipy
 
 Matrix = tuple[tuple[float, ...], ...]
 """Homogeneous transform, 4 rows of 4 numbers."""
-
-IDENTITY_MATRIX = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
-"""Identity transform."""
 
 BASE_JOINTS = {
     "base_x": (1.0, 0.0, 0.0),
@@ -178,7 +176,7 @@ class Chain:
         base: list[Joint] = []
         for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ()):
             most = math.pi if k >= 3 else 1.0
-            offset = IDENTITY_MATRIX if k else _tuples(place)
+            offset = _tuples(np.eye(4) if k else place)
             base.append(Joint(name, k - 1, offset, k >= 3, axis, low=-most, high=most))
         first = turn if base else place @ turn
         shift = len(base)
@@ -247,10 +245,8 @@ def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict
 
 def pose_matrix(position: ArrayLike, rotation: ArrayLike) -> np.ndarray:
     """Homogeneous transform, shape [4, 4], of a position and a quaternion w, x, y, z."""
-    from scipy.spatial.transform import Rotation
-
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
+    matrix[:3, :3] = scipy.spatial.transform.Rotation.from_quat(rotation, scalar_first=True).as_matrix()
     matrix[:3, 3] = position
     return matrix
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from plab.files import pinned
-from plab.kinematics.chain import IDENTITY_MATRIX, Chain, Joint, Link, ModelError, matched, pose_matrix
+from plab.kinematics.chain import Chain, Joint, Link, ModelError, matched, pose_matrix
 
 CAPSULE_RATIO = 1.5
 """Largest ratio of the shorter edges of a mesh's oriented bounding box for fitting a capsule; otherwise the
@@ -132,13 +132,13 @@ def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None,
     radius, half = lengths[:2]
     upright = pose_matrix((0.0, 0.0, 0.0), _ALONG[2])
     if kind == "SPHERE":
-        return "Sphere", [radius], np.array(IDENTITY_MATRIX)
+        return "Sphere", [radius], np.eye(4)
     if kind == "CAPSULE":
         return "Capsule", [2.0 * half, radius], upright
     if kind == "CYLINDER":
         return "Cylinder", [radius, half], upright
     if kind == "BOX":
-        return "Box", lengths, np.array(IDENTITY_MATRIX)
+        return "Box", lengths, np.eye(4)
     if kind != "MESH":
         return None, [], upright
     edges, longest = box[3:], int(np.argmax(box[3:]))

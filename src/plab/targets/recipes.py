@@ -17,6 +17,7 @@ import numpy as np
 from plab.errors import PlabError, located
 from plab.files import ShapeError, one_line, pinned, read_array
 from plab.objective import spread_mass
+from plab.plugins import scipy
 from plab.scenes import Body, Scene, make_body, sample_particles
 
 TARGET_SEED = 1
@@ -180,13 +181,10 @@ class PointsTarget(PointsRecipe):
     fill: bool = False
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        # Imported here, because SciPy would slow down every `--help`.
-        from scipy.spatial import KDTree
-
         with located("target", TargetError):
             points = read_points(*pinned(self.file, self.sha256))
         some = points[:: -(-len(points) // _MEASURED)]
-        distance = float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
+        distance = float(np.median(scipy.spatial.KDTree(points).query(some, k=2)[0][:, 1]))
         # Points farther apart would be isolated dots on the grid.
         if distance > scene.dx:
             raise TargetError(
@@ -208,15 +206,13 @@ class PointsTarget(PointsRecipe):
 def _filled(points: np.ndarray, n: int) -> tuple[np.ndarray, float]:
     """Return the cells that contain points or are enclosed by them, bool, shape [n, n, n], and the fraction
     of hollow cells."""
-    # Imported here, because SciPy would slow down every `--help`.
-    from scipy.ndimage import binary_closing, binary_dilation, binary_fill_holes
-
     cells = np.zeros((n, n, n), bool)
     cells[tuple((points * n).astype(int).clip(0, n - 1).T)] = True
     # Points at the distance of a cell leave empty cells in between.
-    closed = binary_closing(np.pad(cells, 2), np.ones((3, 3, 3)))[2:-2, 2:-2, 2:-2] | cells
-    solid = binary_fill_holes(closed)
-    return solid, float((solid & ~binary_dilation(closed)).sum() / solid.sum())
+    ndimage = scipy.ndimage
+    closed = ndimage.binary_closing(np.pad(cells, 2), np.ones((3, 3, 3)))[2:-2, 2:-2, 2:-2] | cells
+    solid = ndimage.binary_fill_holes(closed)
+    return solid, float((solid & ~ndimage.binary_dilation(closed)).sum() / solid.sum())
 
 
 @dataclass
