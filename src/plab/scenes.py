@@ -16,11 +16,11 @@ import numpy as np
 
 from plab.errors import PlabError
 from plab.laws import Law
+from plab.mesh import Mesh, load_mesh
 from plab.plugins import Registry, scipy
 
 if TYPE_CHECKING:
     from plab.kinematics import Chain
-    from plab.mesh import Mesh
 
 CONVENTIONS = ("plab", "release")
 """Reference implementation whose convention applies: plab's own, or the PlasticineLab release's."""
@@ -197,9 +197,6 @@ def make_body(
         return Body(shape, vector3(center), tuple(size), particles, **material)
     if file is None:
         raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
-    # Imported here, because few scenes have meshes.
-    from plab.mesh import load_mesh
-
     return Body(shape, vector3(center), tuple(size), particles, mesh=load_mesh(file, sha256), **material)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from plab.errors import PlabError, located
 from plab.files import ShapeError, one_line, pinned, read_array
+from plab.mesh import read_mesh
 from plab.objective import spread_mass
 from plab.plugins import scipy
 from plab.scenes import Body, Scene, make_body, sample_particles
@@ -247,8 +248,6 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
     ShapeError if the file cannot be read or contains no points."""
     kind = Path(file).suffix.lower()
     if kind == ".ply":
-        from plab.mesh import read_mesh
-
         points = np.asarray(read_mesh(file).vertices, np.float64)
     elif kind == ".xyz":
         try:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import located
+from plab.kinematics.chain import matched
 from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
@@ -362,9 +363,6 @@ class GestureTarget(Script):
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
         """Sample actions once; see :meth:`Script.sample`."""
-        # Imported here: few tasks have an articulated model.
-        from plab.kinematics.chain import matched
-
         chain = scene.kinematics
         if chain is None:
             raise TargetError("target: the recipe needs a task with kinematics")
