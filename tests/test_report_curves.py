@@ -29,25 +29,26 @@ from plab.report.tables import score_at_budget
 
 
 def test_band_is_mean_and_spread_where_all_runs_are() -> None:
-    one = pd.DataFrame({"episodes": [1, 3, 5], "reward": [0.0, 2.0, 4.0]})
-    other = pd.DataFrame({"episodes": [2, 4], "reward": [3.0, 5.0]})
+    one = pd.DataFrame({"episodes": [1, 3, 5], "reward": [0.0, 2.0, 4.0], "best_score": 0.1})
+    other = pd.DataFrame({"episodes": [2, 4], "reward": [3.0, 5.0], "best_score": 0.2})
     x, mean, std = band([one, other], "episodes", "reward")
     assert x.tolist() == [2, 3, 4]
     np.testing.assert_allclose(mean, [2.0, 3.0, 4.0])
     np.testing.assert_allclose(std, [1.0, 1.0, 1.0])
 
 
-def test_a_run_that_is_solved_keeps_its_score() -> None:
-    solved = pd.DataFrame({"simulated": [1, 3], "best_score": [0.0, 1.0]})
-    other = pd.DataFrame({"simulated": [1, 5], "best_score": [0.0, 0.4]})
-    x, mean, _ = band([solved, other], "simulated", "best_score")
+def test_a_run_that_is_solved_keeps_its_last_value() -> None:
+    solved = pd.DataFrame({"episodes": [1, 3], "reward": [0.0, 9.0], "best_score": [0.0, 1.0]})
+    other = pd.DataFrame({"episodes": [1, 5], "reward": [0.0, 4.0], "best_score": [0.0, 0.4]})
+    x, mean, _ = band([solved, other], "episodes", "reward")
     assert x.tolist() == [1, 3, 5]
-    np.testing.assert_allclose(mean, [0.0, 0.6, 0.7])
-    assert band([solved, solved], "simulated", "best_score")[0].tolist() == [1, 3]
+    np.testing.assert_allclose(mean, [0.0, 5.5, 6.5])
+    assert band([solved, solved], "episodes", "reward")[0].tolist() == [1, 3]
 
 
 def test_values_below_zero_count_as_zero_run_by_run() -> None:
-    runs = [pd.DataFrame({"episodes": [1, 2], "reward": values}) for values in ([-9.0, 4.0], [1.0, -2.0])]
+    rewards = [-9.0, 4.0], [1.0, -2.0]
+    runs = [pd.DataFrame({"episodes": [1, 2], "reward": own, "best_score": 0.0}) for own in rewards]
     assert band(runs, "episodes", "reward")[1].tolist() == [0.5, 2.0]
     assert band(runs, "episodes", "reward", floor=None)[1].tolist() == [-4.0, 1.0]
     # No runs and runs apart give no band.

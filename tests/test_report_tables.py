@@ -192,7 +192,7 @@ def test_runs_that_try_something_are_set_aside(tmp_path: Path, key: str, values:
         save(tmp_path / "results", {key: value, "method.iterations": 200}, seed=seed)
     runs = gather(tmp_path / "results")
     assert (list(runs.table["seed"]), runs.unusual) == (["0"], [])
-    assert runs.left_out[0].startswith(f"{len(values) - 1} run(s) left out: settings")
+    assert runs.left_out[0].startswith(f"{len(values) - 1} run(s) left out: more")
 
 
 def test_a_value_by_task_is_plabs_own_on_that_task() -> None:
@@ -264,6 +264,7 @@ def test_agreement_is_within_two_deviations_or_a_tenth(tmp_path: Path) -> None:
     for (variant, name), score in scores.items():
         synthetic.save(synthetic.run(tmp_path, task="Move", variant=variant, method=name, score=score))
     (table,) = agreement(gather(tmp_path))
+    assert "Settings other than plab's own: method.iterations" in table.notes[-1]
     data = table.data.set_index("method")
     assert data["cells"].to_dict() == {"Adam": 3, "GD": 1, "all": 4}
     assert data["agree"].to_dict() == {"Adam": pytest.approx(2 / 3), "GD": 1.0, "all": 0.75}

@@ -123,7 +123,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         "left out: other tasks, variants, methods or seeds": (
             sum(row.values["status"] == "finished" for row in fitting) - len(complete)
         ),
-        "left out: settings that differ from conf/": len(complete) - len(finished),
+        "left out: more settings that differ from conf/": len(complete) - len(finished),
     }
     left_out = [f"{count} run(s) {what}" for what, count in counts.items() if count]
     return Runs(

@@ -119,7 +119,7 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
     """Return reward against episodes, per task and per configuration, with all methods on one axis."""
     notes = [
         "Reward of an episode (sum over its steps) against episodes simulated so far, including its own.",
-        "Lines: mean over the runs; shaded: one standard deviation.",
+        "Lines: mean over the runs; shaded: one standard deviation. A solved run keeps its last reward.",
         "Values below zero count as zero, as in the paper.",
         *settings_note(runs),
     ]
@@ -216,11 +216,10 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
     legend(figure)
     whole = overall_agreement(cells)
     panel.set_title(
-        f"{len(cells)} configurations, r = {number(whole['correlation'])}, "
-        f"{number(100.0 * whole['agree'], 0)} % agree"
+        f"{len(cells)} cells, r = {number(whole['correlation'])}, {number(100.0 * whole['agree'], 0)} % agree"
     )
     notes = [f"Mean score of each configuration. Grey: within {TOLERANCE:g}. Agree: {AGREES}."]
-    return [Drawing("agreement", figure, notes)]
+    return [Drawing("agreement", figure, [*notes, *settings_note(runs)])]
 
 
 # ------------------------------------------------------------------------------------------------ aggregates

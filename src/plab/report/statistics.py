@@ -253,8 +253,8 @@ def rows_on_axes(config: Mapping[str, Any], rows: Rows) -> Rows:
 def band(
     tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0, points: int = 400
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return mean and standard deviation of a column over runs, on their common range; a solved run keeps its
-    score.
+    """Return mean and standard deviation of a column over runs, on their common range; a solved run, which
+    ends early, keeps its last value.
 
     Args:
         tables: Iterations of each run.
@@ -267,13 +267,13 @@ def band(
         Abscissae, increasing, means and population standard deviations, shape [point] each, at the union of
         the runs' points, with linear interpolation; None without runs.
     """
-    pairs = ((np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables)
-    curves = [(x, y) for x, y in pairs if len(x)]
-    if not curves:
+    tables = [table for table in tables if len(table[axis])]
+    if not tables:
         return None
+    curves = [(np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables]
     low = max(x[0] for x, _ in curves)
-    solved = [column == "best_score" and y[-1] >= SOLVED for _, y in curves]
-    ends = [x[-1] for (x, _), whole in zip(curves, solved, strict=True) if not whole]
+    scores = [np.asarray(table["best_score"])[-1] for table in tables]
+    ends = [x[-1] for (x, _), score in zip(curves, scores, strict=True) if score < SOLVED]
     high = min(ends, default=max(x[-1] for x, _ in curves))
     x = np.unique(np.concatenate([x for x, _ in curves]))
     x = x[(x >= low) & (x <= high)]

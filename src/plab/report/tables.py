@@ -302,7 +302,8 @@ def agreement(runs: Runs) -> list[Table]:
     )
     notes = [
         "Mean scores of common configurations. Correlation: Pearson's. Distance: absolute difference of the "
-        f"means; difference: ours minus the paper's. Agree: {AGREES}."
+        f"means; difference: ours minus the paper's. Agree: {AGREES}.",
+        *settings_note(runs),
     ]
     return [Table("agreement", "comparison", "Agreement with the paper's table", shown, data, notes=notes)]
 
