@@ -381,21 +381,33 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
         ends = [next((k for k, one in enumerate(own) if one >= enough), len(own)) for own in scores]
         return [own[: end + 1] for own, end in zip(scores, ends, strict=True)]
 
-    # One run reaches it after fewer rows than the other, which may not.
-    enough = next(one for one in sorted(scores[0] + scores[1]) if len(set(map(len, until(one)))) == 2)
+    # One run reaches it after fewer rows than the other, which may not; not in the first row.
+    lengths = {one: sorted(map(len, until(one))) for one in sorted(scores[0] + scores[1])}
+    enough = next(one for one, (short, long) in lengths.items() if 1 < short < long)
     for module in (runner, checking):
         monkeypatch.setattr(module, "SOLVED", enough)
     monkeypatch.setattr(runner, "PLAIN_EVERY", 1)
-    cfgs = [make_config(tmp_path, "cem", "progress=true"), make_config(tmp_path, "cem", *OTHER)]
+    intact, left = runner.Runner._conclude, list[int]()
+
+    def conclude(self: runner.Runner) -> None:
+        left.extend(read(track.run.partial_path).rows for track in self.tracks)
+        intact(self)
+
+    monkeypatch.setattr(runner.Runner, "_conclude", conclude)
+    words = "progress=true", "checkpoint_seconds=30"
+    cfgs = [make_config(tmp_path, "cem", *words), make_config(tmp_path, "cem", *OTHER, *words)]
     run_batch(cfgs, cache=CACHE)
     results = [read(cfg.path) for cfg in cfgs]
     assert [result.iterations["score"].tolist() for result in results] == until(enough)
     assert [faults(result) for result in results] == [[], []]
-    # The progress is that of the runs that are not solved.
-    longer = max(len(result.iterations) for result in results)
-    counts = [int(count) for count in re.findall(r" (\d)/4,", capsys.readouterr().out)]
-    assert counts == [*range(1, longer), 4]
-    shorter = min(results, key=lambda result: len(result.iterations))
+    # The progress is that of the runs that are not solved; at the end, that of the last run.
+    shorter, longer = sorted(results, key=lambda result: len(result.iterations))
+    progress = capsys.readouterr().out
+    counts = [int(count) for count in re.findall(r" (\d)/4,", progress)]
+    assert counts == [*range(1, len(longer.iterations)), 4]
+    assert re.findall(r"best score ([\d.]+)", progress)[-1] == f"{longer.iterations['score'].max():.3f}"
+    # A solved run has written its last row.
+    assert left[int(shorter is results[1])] == len(shorter.iterations)
     monkeypatch.setattr(checking, "SOLVED", shorter.iterations["score"].max())
     assert faults(shorter) == []
     monkeypatch.setattr(checking, "SOLVED", 1.0)

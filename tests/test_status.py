@@ -77,6 +77,11 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     assert (run.done, run.total) == (66, 100)
     assert run.rate == pytest.approx(33.0, rel=0.15)
     lock.release()
+    # A solved planner has nothing left to do.
+    lock = acquire(begin(folder, 3, method="cem", score=3.0))
+    (run,) = find(folder, "method=cem").running.itertuples()
+    assert (run.done, run.total, run.score, run.left) == (4, 4, 1.0, 0.0)
+    lock.release()
 
 
 def test_runs_of_a_batch_share_a_process(folder: Path) -> None:

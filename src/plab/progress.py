@@ -23,9 +23,6 @@ PLAIN_EVERY = 10
 """Default number of steps between lines without a terminal."""
 
 
-_TEXTS = ("description", "fields[text]")
-
-
 @contextmanager
 def show_progress(
     title: str,
@@ -52,8 +49,8 @@ def show_progress(
     watch, console = compiling or (lambda note: nullcontext()), Console()
     if enabled and console.is_terminal and multiprocessing.parent_process() is None:
         bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()
-        title_column, text = (TextColumn(f"{{task.{part}}}", markup=False) for part in _TEXTS)
-        with Progress(title_column, *bar, text, console=console, transient=not total) as bars:
+        columns = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
+        with Progress(next(columns), *bar, *columns, console=console, transient=not total) as bars:
             task = bars.add_task(title, total=total, completed=start, text="")
 
             def note(kernel: str) -> None:

@@ -97,6 +97,7 @@ class Track:
         error: Reason of the failure, if any.
         iteration: Number of the next iteration.
         best_loss: Loss of the best actions so far, NaN before the first iteration.
+        best_score: Their score if the family ranks by score, otherwise -inf.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
         contact: Contact model of the rows.
@@ -115,7 +116,7 @@ class Track:
         self.contact = own.contact or cfg.method.contact
         self._by_score = own.ranking == "score"
         known = self._by_score and result.best_iteration >= 0
-        self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
+        self.best_score = float(columns["score"][result.best_iteration]) if known else -math.inf
         self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
 
     @property
@@ -126,7 +127,7 @@ class Track:
     @property
     def solved(self) -> bool:
         """Return True if the run ranks actions by score and has reached the highest score."""
-        return self._best_score >= SOLVED
+        return self.best_score >= SOLVED
 
     def outcome(self) -> Outcome:
         """Return the outcome of the run."""
@@ -173,14 +174,16 @@ class Track:
         # The first loss replaces NaN, which stands for no loss.
         better = not row["loss"] >= self.best_loss
         # Among equal scores, the lowest loss wins.
-        if self._by_score and row["score"] != self._best_score:
-            better = row["score"] > self._best_score
+        if self._by_score and row["score"] != self.best_score:
+            better = row["score"] > self.best_score
         chosen = (step.actions, self.iteration, row["loss"]) if better and step.whole else step.best
         best: dict[str, Any] = {}
         if chosen is not None:
             best = dict(zip(("best_actions", "best_iteration", "best_loss"), chosen, strict=True))
-            (self.best_actions, _, self.best_loss), self._best_score = chosen, row["score"]
-        self.run.record(row, step.state, keep=step.keep, **best)
+            self.best_actions, _, self.best_loss = chosen
+            self.best_score = row["score"] if self._by_score else self.best_score
+        # A solved run has no later iteration that would write its state.
+        self.run.record(row, step.state, keep=step.keep or self.solved, **best)
         self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
         self.iteration += 1
         return row
@@ -227,14 +230,15 @@ class Outcome:
         return self.status in ("finished", "before")
 
 
-def report(outcomes: Sequence[Outcome]) -> int:
-    """Print a summary line of a sweep, and one line on standard error per run without a result; return the
-    exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
+def report(outcomes: Sequence[Outcome], runs: int) -> int:
+    """Print a summary line of a sweep of some runs, and one line on standard error per outcome without a
+    result; return the exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
     count = Counter(one.status for one in outcomes)
     parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
     unfinished = ("failed", "refused", *_UNFINISHED)
     parts += [f"{count[status]} {_UNFINISHED.get(status, status)}" for status in unfinished if count[status]]
-    print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)
+    parts += [f"{left} stopped"] if (left := runs - len(outcomes)) else []
+    print(f"{runs} runs: {', '.join(parts)}", flush=True)
     for one in outcomes:
         if not one.finished:
             print_error(f"{one.title}: {one.message}")
@@ -325,8 +329,10 @@ class Runner:
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
         """Return the text of progress after an iteration, given the means of its rows by column."""
         contact = " and ".join(dict.fromkeys(track.contact for track in tracks))
-        best = np.mean([track.best_loss for track in tracks])
-        return f"loss {means['loss']:.5g} {contact} score {means['score']:.3f} best {best:.5g}"
+        best = f"loss {np.mean([track.best_loss for track in tracks]):.5g}"
+        if self._family.ranking == "score":
+            best = f"score {np.mean([track.best_score for track in tracks]):.3f}"
+        return f"loss {means['loss']:.5g} {contact} score {means['score']:.3f} best {best}"
 
     # ------------------------------------------------------------------------------------ for use in hooks
 
@@ -383,16 +389,17 @@ class Runner:
                 with self._progress("", *self.extent()) as self.report:
                     while active := [track for track in self.tracks if track.open and self.has_more(track)]:
                         self.enter(phase, active)
-                        phase, start, rows = "optimise", time.perf_counter(), list[dict[str, float]]()
+                        phase, start, rows = "optimise", time.perf_counter(), dict[Track, dict[str, float]]()
                         with simulation_errors(f"iteration {active[0].iteration}: "):
                             steps = dict(self.iterate(active))
                         seconds = (time.perf_counter() - start) / len(active)
                         for track, step in steps.items():
                             with track.results_errors():
-                                rows.append(track.record(step, columns, seconds))
+                                rows[track] = row = track.record(step, columns, seconds)
                         if rows:
-                            means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-                            self._shown = "mean " * (len(rows) > 1) + self.summary_line(means, active)
+                            each = rows.values()
+                            means = {name: float(np.mean([own[name] for own in each])) for name in row}
+                            self._shown = "mean " * (len(rows) > 1) + self.summary_line(means, list(rows))
                             self.report(self.extent()[0], self._shown)
             finally:
                 self.enter("")

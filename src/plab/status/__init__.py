@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from plab.config.families import SOLVED
 from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.errors import printable
@@ -148,13 +149,13 @@ def _described(row: Row, state: str) -> dict[str, Any]:
     message = printable(values["message"]) if state == "failed" else ""
     known |= {"state": state, "message": message, "total": total}
     known["done"] = total if state == "done" else int(values["iterations"])
-    return known | (_measured(row.path, total) if state == "running" else {})
+    return known | (_measured(row, total) if state == "running" else {})
 
 
-def _measured(path: Path, total: int) -> dict[str, Any]:
+def _measured(row: Row, total: int) -> dict[str, Any]:
     """Return progress, speed and remaining time of a run in progress, estimated from its latest rows."""
     try:
-        with opened(path) as file:
+        with opened(row.path) as file:
             table, summary = columns_of(file), summary_of(file)
     except ResultsError:
         # It may just have ended and removed its partial file.
@@ -169,6 +170,9 @@ def _measured(path: Path, total: int) -> dict[str, Any]:
     known |= {"done": int(done[-1]), "score": float(table["score"][best])}
     if "kept_score" in table and table["kept_score"][-1] >= 0.0:
         known["score"] = float(table["kept_score"][-1])
+    if row.config["method"]["family"] == "planner" and known["score"] >= SOLVED:
+        # It waits for the other runs of its batch.
+        return known | {"done": total, "left": 0.0}
     # The first row of a process compiles the kernels.
     recent = min(_RECENT_ROWS, count - 1)
     if recent and known["done"] > int(done[-1 - recent]):
