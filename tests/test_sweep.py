@@ -72,10 +72,12 @@ def test_failed_runs_do_not_stop_the_others(sweep) -> None:
     assert len(computed()) == 4
 
 
-def test_refused_runs_do_not_stop_the_others(sweep) -> None:
+def test_refused_runs_do_not_stop_the_others(sweep, capsys) -> None:
     code, counts, lines = sweep("variant=1,9")
     assert (code, counts) == (2, {"runs": 2, "finished": 1, "refused": 1})
     assert len(lines) == 1 and "variant=9" in lines[0]
+    assert main(["-m", *COARSE, "variant=1,9"]) == 2
+    assert capsys.readouterr().out.startswith("1 of 2 runs refused: ")
 
 
 def test_a_bug_in_one_batch_does_not_stop_the_others(sweep) -> None:
@@ -103,8 +105,8 @@ def test_runs_that_cannot_share_a_simulator_are_halved(sweep, monkeypatch) -> No
 
 def test_an_interrupted_batch_is_kept_and_resumed(sweep) -> None:
     with raising(KeyboardInterrupt(), 10, toy_runner, "advance"):
-        code, _, lines = sweep("seed=0,1,2")
-    assert code == 130 and len(lines) == 1
+        code, counts, lines = sweep("seed=0,1,2")
+    assert (code, counts) == (130, {"runs": 3, "stopped": 3}) and len(lines) == 1
     left = [read(cfg.path.with_suffix(".partial.h5")) for cfg in configs()]
     assert [(one.status, one.rows) for one in left] == [("stopped", 4), ("stopped", 3), ("stopped", 3)]
     assert sweep("seed=0,1,2")[:2] == (0, {"runs": 3, "finished": 3})

@@ -90,10 +90,13 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         if settings["per_gpu"]:
             places = _gpu_places(settings["per_gpu"])
             execute, processes = partial(_execute_on_gpus, places), len(places)
+    count = len(by_path) + len(ended)
+    if ended:
+        print(f"{len(ended)} of {count} runs refused: {ended[0].message}", flush=True)
     try:
         ended.extend(run_batches(cfgs, execute, settings["batch_size"], processes, settings["per_gpu"] or 1))
     finally:
-        code = report(ended)
+        code = report(ended, count)
     return code
 
 
