@@ -77,6 +77,8 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     assert (run.done, run.total) == (66, 100)
     assert run.rate == pytest.approx(33.0, rel=0.15)
     lock.release()
+    (run,) = find(folder, "method=ppo").runs.itertuples()
+    assert (run.state, run.done, run.total) == ("interrupted", 66, 100) and run.score >= 0.0
     # A solved planner has nothing left to do.
     lock = acquire(begin(folder, 3, method="cem", score=3.0))
     (run,) = find(folder, "method=cem").running.itertuples()

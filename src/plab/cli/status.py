@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from datetime import timedelta
+from functools import partial
 from typing import Any
 
 from rich.console import Console, Group
@@ -37,10 +38,7 @@ def main(argv: Sequence[str]) -> None:
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
     chosen = select(words, NAMES)
-
-    def look() -> Survey:
-        return survey(sources, chosen, missing=options.missing)
-
+    look = partial(survey, sources, chosen, missing=options.missing)
     if options.form == "json":
         found = look()
         tables = {"runs": found.runs, "groups": found.groups}

@@ -164,7 +164,7 @@ def _rewards(panel: Axes, runs: Runs, series: Series) -> None:
 
 def rl_scores(runs: Runs) -> list[Drawing]:
     """Return the final scores of the RL methods per task, next to the paper's scores and the limit from
-    demonstrations, or None for single bars."""
+    demonstrations, or nothing for single bars."""
     own = runs.table[[method(name).kind == RL for name in runs.table["method"]]]
     scores = own.pivot_table(index="task", columns="method", values="score")
     if scores.size < 2:
@@ -198,7 +198,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
 
 
 def agreement_plot(runs: Runs) -> list[Drawing]:
-    """Plot our mean score of each configuration against the paper's; return None without common cells."""
+    """Plot our mean score of each configuration against the paper's; return nothing without common cells."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
@@ -215,9 +215,8 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
     )
     legend(figure)
     whole = overall_agreement(cells)
-    panel.set_title(
-        f"{len(cells)} cells, r = {number(whole['correlation'])}, {number(100.0 * whole['agree'], 0)} % agree"
-    )
+    r, agree = number(whole["correlation"]), number(100.0 * whole["agree"], 0)
+    panel.set_title(f"{len(cells)} cells, r = {r}, {agree} % agree")
     notes = [f"Mean score of each configuration. Grey: within {TOLERANCE:g}. Agree: {AGREES}."]
     return [Drawing("agreement", figure, [*notes, *settings_note(runs)])]
 
@@ -241,11 +240,8 @@ def _interquartile_means(strata: Mapping[str, Strata], notes: list[str]) -> Draw
         reach = [[max(found.value - found.low, 0.0)], [max(found.high - found.value, 0.0)]]
         panel.errorbar(found.value, position, xerr=reach, fmt="o", color=method(name).colour, capsize=3)
     panel.set_yticks(range(len(strata)), [method(name).label for name in strata])
-    panel.set(
-        ylim=(len(strata) - 0.5, -0.5),
-        xlim=(0.0, 1.0),
-        xlabel="interquartile mean of the normalised incremental IoU",
-    )
+    panel.set(xlim=(0.0, 1.0), ylim=(len(strata) - 0.5, -0.5))
+    panel.set_xlabel("interquartile mean of the normalised incremental IoU")
     return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
 
 

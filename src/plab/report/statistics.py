@@ -99,15 +99,13 @@ def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
 RESAMPLES = 2000
 """Bootstrap samples."""
 
-_SEED = 0
-
 Strata = Sequence[np.ndarray]
 """Scores of the runs of each configuration, shape [run] each."""
 
 
 def interquartile_mean(strata: Strata) -> Interval:
     """Return the interquartile mean of all scores, with its percentile interval."""
-    scores, rng = np.concatenate(strata), np.random.default_rng(_SEED)
+    scores, rng = np.concatenate(strata), np.random.default_rng(0)
     samples = np.concatenate([_drawn(own, rng) for own in strata], axis=1)
     middle = slice(len(scores) // 4, len(scores) - len(scores) // 4)
     found = (np.sort(values)[..., middle].mean(axis=-1) for values in (scores, samples))
@@ -130,7 +128,7 @@ def improvement(ours: Strata, theirs: Strata) -> Interval:
         difference = a[:, :, None] - b[:, None, :]
         return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(1, 2))
 
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(0)
     exact = np.mean([beats(a[None], b[None])[0] for a, b in zip(ours, theirs, strict=True)])
     drawn = [beats(_drawn(a, rng), _drawn(b, rng)) for a, b in zip(ours, theirs, strict=True)]
     return _interval(float(exact), np.mean(drawn, axis=0))

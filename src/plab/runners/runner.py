@@ -97,7 +97,7 @@ class Track:
         error: Reason of the failure, if any.
         iteration: Number of the next iteration.
         best_loss: Loss of the best actions so far, NaN before the first iteration.
-        best_score: Their score if the family ranks by score, otherwise -inf.
+        best_score: Score in their row, if the family ranks by score.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
         contact: Contact model of the rows.
@@ -116,7 +116,7 @@ class Track:
         self.contact = own.contact or cfg.method.contact
         self._by_score = own.ranking == "score"
         known = self._by_score and result.best_iteration >= 0
-        self.best_score = float(columns["score"][result.best_iteration]) if known else -math.inf
+        self.best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
         self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
 
     @property
@@ -127,7 +127,7 @@ class Track:
     @property
     def solved(self) -> bool:
         """Return True if the run ranks actions by score and has reached the highest score."""
-        return self.best_score >= SOLVED
+        return self._by_score and self.best_score >= SOLVED
 
     def outcome(self) -> Outcome:
         """Return the outcome of the run."""
@@ -180,8 +180,7 @@ class Track:
         best: dict[str, Any] = {}
         if chosen is not None:
             best = dict(zip(("best_actions", "best_iteration", "best_loss"), chosen, strict=True))
-            self.best_actions, _, self.best_loss = chosen
-            self.best_score = row["score"] if self._by_score else self.best_score
+            (self.best_actions, _, self.best_loss), self.best_score = chosen, row["score"]
         # A solved run has no later iteration that would write its state.
         self.run.record(row, step.state, keep=step.keep or self.solved, **best)
         self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
@@ -397,8 +396,7 @@ class Runner:
                             with track.results_errors():
                                 rows[track] = row = track.record(step, columns, seconds)
                         if rows:
-                            each = rows.values()
-                            means = {name: float(np.mean([own[name] for own in each])) for name in row}
+                            means = {key: np.mean([own[key] for own in rows.values()]).item() for key in row}
                             self._shown = "mean " * (len(rows) > 1) + self.summary_line(means, list(rows))
                             self.report(self.extent()[0], self._shown)
             finally:

@@ -147,13 +147,12 @@ def _described(row: Row, state: str) -> dict[str, Any]:
     total = row_count(method) or method.get("episodes") or 0
     known = {name: values[name] for name in ("score", "seconds", "path")}
     message = printable(values["message"]) if state == "failed" else ""
-    known |= {"state": state, "message": message, "total": total}
-    known["done"] = total if state == "done" else int(values["iterations"])
-    return known | (_measured(row, total) if state == "running" else {})
+    known |= {"state": state, "message": message, "total": total, "done": total * (state == "done")}
+    return known | (_measured(row, total, state) if state != "done" else {})
 
 
-def _measured(row: Row, total: int) -> dict[str, Any]:
-    """Return progress, speed and remaining time of a run in progress, estimated from its latest rows."""
+def _measured(row: Row, total: int, state: str) -> dict[str, Any]:
+    """Return progress of an unfinished run, and speed and remaining time while it is running."""
     try:
         with opened(row.path) as file:
             table, summary = columns_of(file), summary_of(file)
@@ -175,7 +174,7 @@ def _measured(row: Row, total: int) -> dict[str, Any]:
         return known | {"done": total, "left": 0.0}
     # The first row of a process compiles the kernels.
     recent = min(_RECENT_ROWS, count - 1)
-    if recent and known["done"] > int(done[-1 - recent]):
+    if state == "running" and recent and known["done"] > int(done[-1 - recent]):
         rate = (known["done"] - int(done[-1 - recent])) / max(float(table["seconds"][-recent:].sum()), 1e-9)
         known |= {"left": max((total - known["done"]) / rate, 0.0), "rate": rate / together}
     return known
