@@ -67,15 +67,13 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     (run,) = find(folder, "task=Rope", "variant=1,2,3", "seed=0").running.itertuples()
     assert (run.variant, run.done, run.total) == ("3", 3, 4)
     # Rows take about a second each; the first is left out, for it compiles.
-    assert run.rate == pytest.approx(1.0, abs=0.15)
-    assert run.left <= 1.15
+    assert run.rate == pytest.approx(1.0, abs=0.15) and run.left <= 1.15
     lock.release()
     assert counts(find(folder))["running"] == 0
     # Progress of reinforcement learning is in episodes.
     lock = acquire(begin(folder, 3, method="ppo"))
     (run,) = find(folder, "method=ppo").running.itertuples()
-    assert (run.done, run.total) == (66, 100)
-    assert run.rate == pytest.approx(33.0, rel=0.15)
+    assert (run.done, run.total, run.rate) == (66, 100, pytest.approx(33.0, rel=0.15))
     lock.release()
     (run,) = find(folder, "method=ppo").runs.itertuples()
     assert (run.state, run.done, run.total) == ("interrupted", 66, 100) and run.score >= 0.0
@@ -99,11 +97,9 @@ def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
     found = find(folder, "task=Move", "variant=1")
     assert found.workers == 1
     for run in found.running.itertuples():
-        assert run.together == 3
-        assert run.rate == pytest.approx(0.1 / run.together)
+        assert (run.together, run.rate) == (3, pytest.approx(0.1 / 3))
     # Three times ten seconds, less what has gone by since.
-    assert 0.0 < found.eta <= 32.0
-    assert found.running["left"].sum() <= 30.0
+    assert 0.0 < found.eta <= 32.0 and found.running["left"].sum() <= 30.0
     for lock in locks:
         lock.release()
 
