@@ -330,7 +330,7 @@ class Runner:
         contact = " and ".join(dict.fromkeys(track.contact for track in tracks))
         best = f"loss {np.mean([track.best_loss for track in tracks]):.5g}"
         if self._family.ranking == "score":
-            best = f"score {np.mean([track.best_score for track in tracks]):.3f}"
+            best = f"score {np.mean([t.best_score for t in self.tracks if t.error is None]):.3f}"
         return f"loss {means['loss']:.5g} {contact} score {means['score']:.3f} best {best}"
 
     # ------------------------------------------------------------------------------------ for use in hooks
