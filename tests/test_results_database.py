@@ -246,8 +246,8 @@ def test_scores(folder: Path, told, capsys) -> None:
     assert [(row["status"], row["seed"]) for row in listed] == [("finished", seed) for seed in range(3)]
     assert [row["score"] for row in listed] == pytest.approx([0.5, 0.75, 0.25])
     assert listed[0]["targets"] is None
-    for words in (["--keys", "method.lt"], ["--sort", "iou"]):
-        assert words[-1] in told(["scores", str(folder), *words], main)
+    for words in (["--keys", "method.lt"], ["--sort", "iou"], ["task=Ropee"]):
+        assert words[-1].rpartition("=")[2] in told(["scores", str(folder), *words], main)
 
 
 def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told) -> None:

@@ -24,12 +24,12 @@ from plab.cli.command import (
     results_source,
     sources_and_words,
 )
-from plab.config.selection import require_possible, select
+from plab.config.selection import select
 from plab.errors import print_error, printable
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.run_file import ResultsError
-from plab.results.run_table import query, rows, scores
+from plab.results.run_table import query, scores
 
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 
@@ -108,8 +108,6 @@ def _pack(argv: Sequence[str]) -> None:
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
     chosen = select(words, SELECTABLE)
-    if words:
-        require_possible(chosen, rows(sources)[0])
     count, unreadable = pack(sources, options.output, chosen, options.digits)
     _report_skipped(unreadable)
     print(f"{options.output}: {count} run(s), {options.output.stat().st_size / 1e3:.1f} kB")

@@ -108,5 +108,5 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
             raise ArgumentError(f"no run has the key '{key}'")
 
 
-_OPEN = {"variant": r"random\d+", "seed": r"\d+"}
+_OPEN = {"variant": r"random\d+", "seed": r"\d+", "status": "running|failed|stopped|finished"}
 """Additional allowed values."""

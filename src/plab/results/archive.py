@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from plab.config.run import member_name
-from plab.config.selection import Selection
+from plab.config.selection import Selection, require_possible
 from plab.results.run_file import ARCHIVE_SUFFIX, ResultsError, RunResult, encode, read, replace_file
 from plab.results.run_table import Row, rows
 
@@ -47,6 +47,7 @@ def pack(
         Number of runs in the archive, and the errors of unreadable files, which are omitted.
 
     Raises:
+        ArgumentError: If the selection cannot match any run.
         ResultsError: If there is nothing to pack, none of the files or archives in ``source`` can be read,
             two runs have the same name, or the archive cannot be written.
     """
@@ -54,6 +55,8 @@ def pack(
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = rows(source)
+    if chosen is not None:
+        require_possible(chosen, found)
     packed: dict[str, Row] = {}
     for row in found:
         if row.values["status"] == "finished" and (chosen is None or chosen(row.values, row.config)):

@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from plab.config.run import SUFFIX
-from plab.config.selection import Selection, leaves, lookup
+from plab.config.selection import Selection, leaves, lookup, require_possible
 from plab.errors import ArgumentError
 from plab.files import cache_dir
 from plab.plugins import pandas as pd
@@ -234,12 +234,11 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
         if _final(path) in files:
             del files[path]
     place = _index_place(root)
-    known: Index = {}
+    known, kept = Index(), Index()
     # Missing or damaged, the index is built again.
     with suppress(OSError, EOFError, ValueError, zlib.error):
         known = dict(json.loads(gzip.decompress(place.read_bytes()))) if index else {}
     now = time.time()
-    kept: Index = {}
     for path, status in files.items():
         name = os.path.relpath(path, root)
         # The inode's change time cannot be set back, unlike the modification time.
@@ -404,10 +403,12 @@ def scores(
         plab's own), status, score and ``keys``; ``score`` as in :func:`plab.results.load`.
 
     Raises:
-        ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
+        ArgumentError: If the selection cannot match any run, no run has one of ``keys``, or a column of
+            ``sort`` does not exist.
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     found, unreadable = rows(source)
+    require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     looked_up = {key: key for key in keys} | _SETTINGS
     columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
@@ -418,9 +419,7 @@ def scores(
     if strange := [key for key in keys if fitting and table[key].isna().all()]:
         raise ArgumentError(f"no run has '{strange[0]}': use columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
-        raise ArgumentError(
-            f"there is no column '{missing[0]}' to sort by; choose from: {', '.join(columns)}"
-        )
+        raise ArgumentError(f"there is no column '{missing[0]}' to sort by: add it to --keys")
     by = [*sort, *(name for name in NAMES if name not in sort)]
     directions = [not descending] * len(sort) + [True] * (len(by) - len(sort))
     ordered = table.sort_values(by, ascending=directions, key=_comparable, kind="stable")
