@@ -178,9 +178,10 @@ if run is not None and run.best_actions is not None:
         picture = Path(folder) / "strip.png"
         try:
             require_graphics()
-            from plab.render.pictures import draw_strip
+            from plab.render.pictures import save
+            from plab.render.rollouts import record, result
 
-            draw_strip(run.path, picture)
+            save(record(*result(run.path)), picture, (480, 360))
             display(Image(picture.read_bytes(), width=1000, alt="start, target and end"))
         except PlabError as error:
             show_text(f"No pictures: {error}")

@@ -28,7 +28,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "cameras.yaml").write_text(
         "top: {position: [0.5, 2, 0.5], target: [0.5, 0, 0.5], size: [8, 4]}"
     )
-    words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", *SEARCH]
+    words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "task.floor_friction=2", *SEARCH]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder

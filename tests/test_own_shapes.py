@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 import struct
 import sys
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pages import ROOT, blocks
+from plab.cli.rollouts import resolve_rollout
 from plab.cli.run import main
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.files import ShapeError
@@ -89,7 +91,9 @@ def test_runs_of_each_kind_of_target_are_read_without_the_files(star_files, tmp_
     path = tmp_path / table[table["variant"] == "1"]["path"].iloc[0]
     with pytest.raises(RenderError, match=r"task\.bodies\.star: .*star\.obj"):
         stored(path)
-    Path("gone.obj").rename("star.obj")
+    Path("kept").mkdir()
+    Path("gone.obj").rename("kept/star.obj")
+    resolve_rollout(Namespace(what=[str(path)], config_dir="kept", output=None), ".png")
     assert stored(path)[1].shape == (2, 3)
 
 

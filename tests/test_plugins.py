@@ -30,11 +30,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path, monkeypatch) -> None:
     (folder / "zz_inside.py").write_text("FOUND = 1\n")
     (folder.parent / "zz_above.py").write_text("FOUND = 2\n")
+    (folder.parent.parent / "zz_here.py").write_text("FOUND = 3\n")
+    monkeypatch.chdir(folder.parent.parent)
     with pytest.raises(ConfigError, match="zz_inside"):
         load_object("zz_inside:FOUND", int)
     search_in(folder)
     search_in(folder)
-    assert [load_object(f"zz_{where}:FOUND", int) for where in ("inside", "above")] == [1, 2]
+    assert [load_object(f"zz_{where}:FOUND", int) for where in ("inside", "above", "here")] == [1, 2, 3]
     # Behind everything else, and once.
     assert sys.path[-2:] == [str(folder), str(folder.parent)] and sys.path.count(str(folder)) == 1
     # Environments are registered before the user's modules are imported.

@@ -235,7 +235,7 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
         assert checksum(configuration.config()) == checksum(cfg)
     drawn = load_config(["task=Move", "variant=random", "seed_scene=3"])
     assert "Move-vrandom3" in why(configuration_of, drawn)
-    for word in ("protocol.floor=release", "targets.source=there"):
+    for word in ("protocol.floor=release", "targets.source=there", "task.name=Mine"):
         assert "protocol=plab" in why(configuration_of, load_config(["task=Move", word]))
 
 

@@ -1,6 +1,7 @@
 """Loading of objects named as ``module:NAME`` in a configuration, from plab or from external files.
 
-Modules are searched for in Python's path, then in the config folder (``--config-dir``) and its parent folder.
+Modules are searched for in Python's path, then in the config folder (``--config-dir``), its parent folder and
+the working directory.
 Results record only the text, which does not depend on the computer.
 """
 
@@ -96,6 +97,8 @@ def _imported(text: str, name: str) -> ModuleType:
     if name.partition(".")[0] != "plab":
         # Registers plab's environments, which the module may create.
         import_module("plab.envs")
+        # The working directory, which only ``python -m plab`` searches by itself.
+        sys.path += [""] * ("" not in sys.path)
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

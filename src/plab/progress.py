@@ -83,7 +83,7 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
         if last == start or done // every > last // every or done == total:
             seconds = task.time_remaining
             left = "started" if seconds is None else f"{timedelta(seconds=seconds)} left"
-            print(f"{title} {done}/{total}, {left}, {text}", flush=True)
+            print(", ".join(filter(None, (f"{title} {done}/{total}", left, text))), flush=True)
         last = done
 
     return report

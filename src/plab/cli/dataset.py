@@ -24,10 +24,10 @@ from plab.cli.command import (
     print_table,
     sources_and_words,
 )
-from plab.config import Config
-from plab.config.compose import check_sources, require_runnable
-from plab.config.overrides import parse, prepared
-from plab.config.selection import OBSERVATION_KEYS
+from plab.config import Config, choices, load_config
+from plab.config.compose import check_overrides, check_sources, require_runnable
+from plab.config.overrides import RANDOM, parse, prepared, quoted
+from plab.config.selection import OBSERVATION_KEYS, leaves
 from plab.config.suite import SUITE_VARIANTS
 from plab.demonstrations import known_actions
 from plab.demonstrations.minari import DatasetError, Episode, write_dataset
@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> None:
     add("--min-score", type=float, default=0.0, metavar="S", help="skip episodes with a lower score")
     what = "scenes simulated at a time (default: 25)"
     add("--together", type=positive, default=25, metavar="N", help=what)
-    add("--config-dir", metavar="FOLDER", help="folder with your own tasks, as for plab run")
+    add("--config-dir", metavar="FOLDER", help="folder with your own tasks and modules, as for plab run")
     options = parser.parse_intermixed_args(argv)
     output = options.output or Path(os.environ.get("MINARI_DATASETS_PATH") or "datasets")
     cameras = None if options.cameras is None else _cameras(options.cameras)
@@ -100,7 +100,7 @@ def main(argv: Sequence[str]) -> None:
         episodes = (one for one in _episodes(own, batch) if one.attributes["score"] >= options.min_score)
         sources = ", ".join(sorted({one.source for one in own}))
         about = {"algorithm_name": sources, "code_permalink": "", "author": ["plab"], "author_email": []}
-        spec = _env_spec(cfgs[0], observe, cameras)
+        spec = _env_spec(cfgs[0], observe, cameras, options.config_dir)
         kept = write_dataset(output, name, episodes, _spaces(own, batch, observe), spec, about)
         scores = [one["score"] for one in kept]
         rows.append([output / name, len(kept), len(own) - len(kept), np.mean(scores), min(scores)])
@@ -121,6 +121,7 @@ def _cameras(path: Path) -> dict[str, Camera]:
 def _demonstrations(options: Namespace) -> list[Demonstration]:
     sources, words = sources_and_words(options.what, default=None)
     config_dir = options.config_dir
+    check_overrides([], config_dir)
     if sources:
         return _of_results(sources, words)
     from plab.sweep.execution import compose_jobs, jobs_of
@@ -227,14 +228,28 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
             )
 
 
-def _env_spec(cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None) -> EnvSpec:
+def _env_spec(
+    cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None, config_dir: str | None
+) -> EnvSpec:
     """Return the specification of an environment, for minari's ``recover_environment``."""
-    words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVATION_KEYS)]
-    words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
-    words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
-    variant = cfg.variant if cfg.seed_scene is None else "random"
+    if cfg.task.name not in choices("task", config_dir):
+        raise ArgumentError(f"{cfg.task.name} is a task of your own: add --config-dir with its folder")
+    variant, words = cfg.variant, [f"protocol={cfg.protocol.name}"]
+    if cfg.seed_scene is not None:
+        variant, words = RANDOM, [*words, f"seed_scene={cfg.seed_scene}"]
+    usual = load_config([f"task={cfg.task.name}", f"variant={variant}", *words], config_dir)
+    values, simulated = dict(leaves(asdict(usual))), ("task.", "sim.", "protocol.", "targets.")
+    task = replace(cfg.task, variants=usual.task.variants, randomize=usual.task.randomize)
+    for key, value in leaves(asdict(replace(cfg, task=task))):
+        if value != values.get(key) and key.startswith((*simulated, "seed_particles", *OBSERVATION_KEYS)):
+            # A variant would replace other overrides of the task.
+            place = key if variant == RANDOM else key.replace("task.", f"task.variants.{variant}.", 1)
+            text = "null" if value is None else quoted(value) if isinstance(value, str) else value
+            words.append(f"++{place}={text}")
     kwargs: dict[str, Any] = {"task": cfg.task.name, "variant": variant, "overrides": words}
     kwargs["observe"] = observe
+    if config_dir is not None:
+        kwargs["config_dir"] = str(Path(config_dir).expanduser().resolve())
     if cfg.task.randomize:
         kwargs["randomize"] = cfg.task.randomize
     if cameras is not None:

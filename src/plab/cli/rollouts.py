@@ -19,7 +19,7 @@ from plab.cli.command import (
     to_write,
 )
 from plab.config import choices, load_config
-from plab.config.compose import check_sources
+from plab.config.compose import check_overrides, check_sources
 from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ArgumentError
 from plab.render.graphics import RenderError, require_graphics, require_packages
@@ -167,7 +167,7 @@ def _parser(name: str, text: str | None, every: str) -> Parser:
     add = parser.add_argument
     add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of plab run")
     add("--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps")
-    add("--config-dir", metavar="FOLDER", help="folder with your own tasks, as for plab run")
+    add("--config-dir", metavar="FOLDER", help="folder with your own tasks and modules, as for plab run")
     return parser
 
 
@@ -188,6 +188,7 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
     from plab.results.run_file import ARCHIVE_SUFFIX, split_archive
 
     sources, words = sources_and_words(options.what, default=None)
+    check_overrides([], options.config_dir)
     if sources and all(str(one).endswith(ARCHIVE_SUFFIX) or one.is_dir() for one in sources):
         # Ties are broken as on the results page.
         found = finished_rows(sources, words)

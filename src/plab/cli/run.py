@@ -56,8 +56,10 @@ def main(argv: Sequence[str]) -> int:
         try:
             run_config(cfg)
             if cfg.progress:
-                result, folder = shlex.quote(str(cfg.path)), shlex.quote(cfg.results_dir)
-                print(f"a picture: plab render {result}; a page of all runs: plab report html {folder}")
+                own = [] if config_dir is None else ["--config-dir", config_dir]
+                picture = shlex.join(["plab", "render", str(cfg.path), *own])
+                page = shlex.join(["plab", "report", "html", cfg.results_dir])
+                print(f"a picture: {picture}; a page of all runs: {page}")
             sys.stdout.flush()
         except BrokenPipeError:
             # The exit code is that of the run if only its last lines could not be printed.

@@ -176,10 +176,3 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
             drawn()
     if troubles:
         raise RenderError("; ".join(troubles))
-
-
-def draw_strip(path: Path, picture: Path) -> None:
-    """Replay a run from its result file, and write initial state, target and final state side by side as
-    PNG."""
-    require_graphics()
-    save(record(*result(path)), picture, _PAGE_SIZE)

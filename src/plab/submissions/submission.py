@@ -109,11 +109,13 @@ def configuration_of(cfg: Config) -> Configuration:
         SubmissionError: If the leaderboard has no such configuration.
     """
     own = {cfg.protocol.start, cfg.protocol.numbers, cfg.protocol.floor} == {"plab"}
-    if not own or cfg.targets.source is not None or cfg.variant not in VARIANTS:
+    own = own and cfg.targets.source is None and cfg.task.name in suite_tasks()
+    if not own or cfg.variant not in VARIANTS:
         seeds = f"seed_scene={UNSEEN[0].removeprefix('random')} to {UNSEEN[-1].removeprefix('random')}"
         raise SubmissionError(
             f"{cfg.task.name}-v{cfg.variant} is not a configuration of the leaderboard, which has "
-            f"protocol=plab, plab's own targets, and the variants 1 to 5, or variant=random with {seeds}"
+            f"the tasks of the suite, protocol=plab, plab's own targets, and the variants 1 to 5, or "
+            f"variant=random with {seeds}"
         )
     return Configuration(cfg.task.name, cfg.variant)
 
