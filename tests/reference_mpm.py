@@ -111,7 +111,7 @@ def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
     e_dev = e - e.mean(dim=-1, keepdim=True)
     length = ((e_dev * e_dev).sum(dim=-1, keepdim=True) + 1e-8).sqrt()
     yield_stress = _of_particles(scene, len(F_trial), [m.yield_stress for m in scene.materials])
-    mu = _of_particles(scene, len(F_trial), [m.shear_modulus for m in scene.materials])
+    mu = _of_particles(scene, len(F_trial), [m.lame[0] for m in scene.materials])
     dg = length - yield_stress / (2.0 * mu)
     yields = dg > 0
     dg = torch.where(yields, dg, 0.0)  # an infinite yield stress must not reach the other branch's derivative
@@ -122,8 +122,8 @@ def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
 def kirchhoff_stress(scene: Scene, F: Tensor, R: Tensor) -> Tensor:
     """Fixed-corotated stress tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Kirchhoff), [particle, 3, 3]."""
     J = torch.linalg.det(F)[:, None, None]
-    mu = _of_particles(scene, len(F), [m.shear_modulus for m in scene.materials])[..., None]
-    lam = _of_particles(scene, len(F), [m.lame_lambda for m in scene.materials])[..., None]
+    mu = _of_particles(scene, len(F), [m.lame[0] for m in scene.materials])[..., None]
+    lam = _of_particles(scene, len(F), [m.lame[1] for m in scene.materials])[..., None]
     return 2.0 * mu * (F - R) @ F.mT + lam * J * (J - 1.0) * _identity()
 
 

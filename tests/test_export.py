@@ -56,7 +56,7 @@ def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
     strain = np.log(1.2) * np.sqrt((2 / 3) ** 2 + 2 * (1 / 3) ** 2)
     assert found["elastic_strain"] == pytest.approx(strain)
     assert np.all(found["yielding"] == 1.0)
-    stiff = dataclasses.replace(scene, yield_stress=4 * strain * 2 * scene.material.shear_modulus)
+    stiff = dataclasses.replace(scene, yield_stress=4 * strain * 2 * scene.material.lame[0])
     found = files.quantities(dataclasses.replace(recording, F=F, scene=stiff), 2)
     assert found["yielding"] == pytest.approx(0.25)
 

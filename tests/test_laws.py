@@ -375,8 +375,8 @@ def test_laws_are_found_by_name() -> None:
     assert Material(5000.0, 0.2, 50.0).kind is LAWS["von_mises"]
     with pytest.raises(ValueError, match="law 'drucker' does not exist; choose from: von_mises"):
         find_law("drucker")
-    with pytest.raises(ValueError, match=r"friction is not a parameter of law elastic"):
-        Material(5000.0, 0.2, 50.0, "elastic", (("friction", 1.0),)).validate()
+    with pytest.raises(ValueError, match=r"parameters\.youngs_modulus is not one of law elastic \(none\)"):
+        Material(5000.0, 0.2, 50.0, "elastic", (("youngs_modulus", 1.0),)).validate()
     with pytest.raises(ValueError, match=r"friction_angle 95 is outside \[0, 90\)"):
         Material(5000.0, 0.2, 50.0, "drucker_prager", (("friction_angle", 95.0),)).validate()
 

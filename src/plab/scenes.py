@@ -16,6 +16,7 @@ import numpy as np
 
 from plab.errors import PlabError
 from plab.laws import Law
+from plab.laws.elastic import lame
 from plab.mesh import Mesh, load_mesh
 from plab.plugins import Registry, scipy
 
@@ -101,15 +102,9 @@ class Material:
         return {key: given.get(key, default) for key, default in self.kind.defaults.items()}
 
     @property
-    def shear_modulus(self) -> float:
-        """Lame parameter mu."""
-        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
-
-    @property
-    def lame_lambda(self) -> float:
-        """Lame parameter lambda."""
-        nu = self.poisson_ratio
-        return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    def lame(self) -> tuple[float, float]:
+        """Lame parameters mu and lambda."""
+        return lame(self.youngs_modulus, self.poisson_ratio)
 
     def largest_step(self, dx: float) -> float:
         """Return the largest stable time step [s] on a grid of spacing dx."""
@@ -117,11 +112,11 @@ class Material:
 
     def validate(self, label: str = "") -> None:
         """Raise SceneError, with a message that begins with ``label``, if a value is out of range."""
+        known = [key for key in self.kind.keys if key not in MATERIAL_KEYS]
         for name in dict(self.parameters):
-            if name not in self.kind.keys:
-                raise SceneError(
-                    f"{label}{name} is not a parameter of law {self.law}: {', '.join(self.kind.keys)}"
-                )
+            if name not in known:
+                only = ", ".join(known) or "none"
+                raise SceneError(f"{label}parameters.{name} is not one of law {self.law} ({only}): remove it")
         for parameter in self.kind.parameters:
             value = self.values[parameter.name]
             if not parameter.admits(value):

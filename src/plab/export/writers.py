@@ -120,9 +120,9 @@ def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
     scene, F = recording.scene, recording.F[step]
     hencky = np.log(np.linalg.svd(F, compute_uv=False))
     strain = np.linalg.norm(hencky - hencky.mean(axis=1, keepdims=True), axis=1)
-    # With a yield stress of 0, as in a fluid, every particle yields.
+    # With a yield stress of 0 every particle yields; without one, as in a fluid, none does.
     limits = [
-        max(m.values.get("yield_stress", np.inf) / (2.0 * m.shear_modulus), np.finfo(float).tiny)
+        max(m.values.get("yield_stress", np.inf) / (2.0 * m.lame[0]), np.finfo(float).tiny)
         for m in scene.materials
     ]
     body = scene.particle_bodies

@@ -136,18 +136,16 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
         values[name] = np.broadcast_to(table, counts)
     changed = []
     for e, scene in enumerate(scenes):
-        # A single material belongs to the scene, not to a body.
-        single = scene.material_count == 1
+        if scene.material_count == 1:
+            # A single material belongs to the scene, not to a body.
+            changed.append(replace(scene, **{key: float(table[e, 0]) for key, table in values.items()}))
+            continue
         bodies = []
         for b, (body, material) in enumerate(zip(scene.bodies, scene.materials, strict=True)):
             own = {key: float(table[e, b]) for key, table in values.items() if key in material.kind.keys}
             fields: dict[str, Any] = {key: own.pop(key) for key in MATERIAL_KEYS if key in own}
-            fields = dict.fromkeys(fields) if single else fields
             bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **own}))
-        shared: dict[str, Any] = {
-            key: float(values[key][e, 0]) for key in MATERIAL_KEYS if single and key in values
-        }
-        changed.append(replace(scene, bodies=tuple(bodies), **shared))
+        changed.append(replace(scene, bodies=tuple(bodies)))
     return tuple(changed)
 
 
