@@ -77,7 +77,7 @@ def test_a_relative_folder_with_a_method(own, seen):
         (None, ["variant=2", "task.yield_stress=100"], "task.variants.2.yield_stress"),
         (None, ["task.youngs_modulus=50000"], "dt 0.0001"),
         (("\nname", "\n\tname"), [], "Dumbbell.yaml, line 4"),
-        (("floor_friction: 1.5", "gravity: 3"), [], "gravity"),
+        (("floor_friction: 1.5", ""), [], "task.floor_friction is missing"),
         (("name: Dumbbell", "name: my task"), [], "task.name"),
         (("yield_stress: 200.0", "yield_stress: ${nowhere}"), [], "nowhere"),
         (("yield_stress: 200.0", "yield_stress: soft"), [], "task.yield_stress"),
@@ -86,7 +86,7 @@ def test_a_relative_folder_with_a_method(own, seen):
         (("  shift:", "  shfit:"), ["variant=random"], "'shfit'"),
         (("    size: [0.06]        # sphere", "    sise: [0.06]  # sphere"), [], "task.bodies.left.sise"),
         (("recipe: bodies", "recipe: balls"), [], "task.target.recipe"),
-        (("size: [0.03]", "size: 0.03"), [], "task.manipulators.left.size"),
+        (("size: [0.03]", "size: 0.03"), [], "task.manipulators.left.size: must be a list"),
     ],
 )
 def test_a_mistake_in_the_file_is_one_line(refused, own, piece, overrides, named):

@@ -222,10 +222,10 @@ def positive(text: str) -> int:
 
 def task_list(text: str) -> list[str]:
     """Parse comma-separated names of tasks."""
-    names = [name.strip() for name in text.split(",")]
+    names, known = [name.strip() for name in text.split(",")], [*suite_tasks(), *EXTENSION_TASKS]
     for name in names:
-        if name not in (*suite_tasks(), *EXTENSION_TASKS):
-            raise ArgumentTypeError(f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}")
+        if name not in known:
+            raise ArgumentTypeError(f"there is no task '{name}'; {suggest(name, known)}")
     return names
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
@@ -133,9 +133,12 @@ def _explain(error: Exception) -> str:
         return f"{file[1]}.yaml: {_explain(cause)}"
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _unknown_key(cause)
+    if isinstance(cause, MissingMandatoryValue):
+        return f"{cause.full_key} is missing: set it"
     if cause is not None:
-        place = f"{cause.full_key}: " if cause.full_key else ""
-        return place + (cause.msg or str(cause)).strip().splitlines()[0]
+        text = (cause.msg or str(cause)).strip().splitlines()[0]
+        text = re.sub(".* is not a ListConfig.*", "must be a list, such as [0.1]", text)
+        return f"{cause.full_key}: {text}" if cause.full_key else text
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
