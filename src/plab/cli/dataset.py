@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from argparse import Namespace
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -228,9 +228,7 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
             )
 
 
-def _env_spec(
-    cfg: Config, observe: str | list[str], cameras: Mapping[str, Camera] | None, config_dir: str | None
-) -> EnvSpec:
+def _env_spec(cfg: Config, observe: str | list[str], cameras: Any, config_dir: str | None) -> EnvSpec:
     """Return the specification of an environment, for minari's ``recover_environment``."""
     if cfg.task.name not in choices("task", config_dir):
         raise ArgumentError(f"{cfg.task.name} is a task of your own: add --config-dir with its folder")
@@ -246,12 +244,8 @@ def _env_spec(
             place = key if variant == RANDOM else key.replace("task.", f"task.variants.{variant}.", 1)
             text = "null" if value is None else quoted(value) if isinstance(value, str) else value
             words.append(f"++{place}={text}")
-    kwargs: dict[str, Any] = {"task": cfg.task.name, "variant": variant, "overrides": words}
-    kwargs["observe"] = observe
-    if config_dir is not None:
-        kwargs["config_dir"] = str(Path(config_dir).expanduser().resolve())
-    if cfg.task.randomize:
-        kwargs["randomize"] = cfg.task.randomize
-    if cameras is not None:
-        kwargs["cameras"] = {name: asdict(camera) for name, camera in cameras.items()}
+    seen = {"observe": observe, "cameras": cameras and {name: asdict(own) for name, own in cameras.items()}}
+    kwargs = {"task": cfg.task.name, "variant": variant, "overrides": words, **seen}
+    kwargs["config_dir"] = config_dir and str(Path(config_dir).expanduser().resolve())
+    kwargs["randomize"] = cfg.task.randomize or None
     return EnvSpec(f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs)

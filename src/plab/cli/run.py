@@ -57,9 +57,8 @@ def main(argv: Sequence[str]) -> int:
             run_config(cfg)
             if cfg.progress:
                 own = [] if config_dir is None else ["--config-dir", config_dir]
-                picture = shlex.join(["plab", "render", str(cfg.path), *own])
-                page = shlex.join(["plab", "report", "html", cfg.results_dir])
-                print(f"a picture: {picture}; a page of all runs: {page}")
+                result, folder = shlex.join([str(cfg.path), *own]), shlex.quote(cfg.results_dir)
+                print(f"a picture: plab render {result}; a page of all runs: plab report html {folder}")
             sys.stdout.flush()
         except BrokenPipeError:
             # The exit code is that of the run if only its last lines could not be printed.

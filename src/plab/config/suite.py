@@ -32,7 +32,7 @@ def conf_folder() -> Path:
 
 def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
     """Return the files of a group, such as ``task``, by name, sorted: plab's own files and the user's."""
-    folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir)])]
+    folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir).expanduser()])]
     files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
     return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
 

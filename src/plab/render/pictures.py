@@ -26,9 +26,7 @@ STEPS_PER_SECOND = 20
 
 _HOLD = 1.0  # duration of the last frame of a film [s]
 _FILM_COLORS = 96  # of a GIF
-_SET_EVERY = 2  # environment steps between frames of a set
-
-_PAGE_SIZE = (480, 360)
+_SET_EVERY, _SET_SIZE = 2, (480, 360)  # of a set: environment steps between frames, pixels
 
 
 def check_output(path: Path) -> None:
@@ -56,11 +54,11 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         replace_file(path, fresh.read_bytes())
 
 
-def save_set(recording: RecordedRollout, folder: Path, size: tuple[int, int], *, film: bool) -> None:
-    """Write pictures of a rollout with a size [pixels, even numbers]: ``start.webp``, ``target.webp`` and the
+def save_set(recording: RecordedRollout, folder: Path, *, film: bool) -> None:
+    """Write pictures of a rollout: ``start.webp``, ``target.webp`` and the
     final state ``end.webp``; and a film ``end.mp4``, if requested and imageio-ffmpeg is installed."""
     first, last = recording.poses[0], recording.poses[-1]
-    with _renderer(recording, size) as renderer:
+    with _renderer(recording, _SET_SIZE) as renderer:
         pictures = {"start": renderer.frame(recording.x[0], first), "target": renderer.target(first)}
         pictures["end"] = renderer.frame(recording.x[-1], last)
         for what, picture in pictures.items():
@@ -171,7 +169,7 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
                 troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue
             with complete_folder(folder) as fresh:
-                save_set(recording, fresh, _PAGE_SIZE, film=film)
+                save_set(recording, fresh, film=film)
             report(number, folder.name)
             drawn()
     if troubles:

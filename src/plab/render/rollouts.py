@@ -96,10 +96,8 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
     return cfg, actions
 
 
-@functools.cache
-def _defaults() -> Config:
-    """Return plab's default configuration, cached because composition takes a third of a second."""
-    return load_config()
+_defaults = functools.cache(load_config)
+"""plab's default configuration, cached because composition takes a third of a second."""
 
 
 def demonstration(cfg: Config) -> np.ndarray:
@@ -163,7 +161,5 @@ def _recording(
     )
 
 
-@functools.cache
-def print_once(message: str) -> None:
-    """Print a message once, even if it applies to several runs."""
-    print_error(message)
+print_once = functools.cache(print_error)
+"""Print a message once, even if it applies to several runs."""
