@@ -73,7 +73,7 @@ def test_targets_are_those_that_were_published(task, device):
     np.testing.assert_allclose(table["moved"], expected["moved"], atol=2e-3)
 
 
-def test_thin_manipulators_are_warned_of(caplog) -> None:
+def test_thin_manipulators_and_targets_without_gain_are_warned_of(caplog) -> None:
     """The warning gives number and thickness of manipulators that fit between two nodes."""
     for radius, lines in ((0.01, 1), (0.02, 0)):
         caplog.clear()
@@ -81,3 +81,5 @@ def test_thin_manipulators_are_warned_of(caplog) -> None:
         found = [line for line in caplog.messages if "passes through bodies" in line]
         assert len(found) == lines
         assert all(line.startswith("manipulators[0] is 0.02 thin") for line in found)
+    Problem([load_config(["task=Torus", *COARSE])])
+    assert caplog.messages[-1].startswith("Torus-v1: the score is only 0 or 1, ")

@@ -175,7 +175,6 @@ class Problem:
         first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or make_simulator(cfgs)
         self.scenes = self.simulator.scenes
-        _warn_of_thin(self.scenes)
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
@@ -192,6 +191,15 @@ class Problem:
         self._held_weights = Constants(self.weights)
         self._relative_target: tuple[np.ndarray, Constants] | None = None
         self.refresh(kinds)
+        blind = {
+            f"{cfg.task.name}-v{cfg.variant}: the score is only 0 or 1, because the start's soft IoU with "
+            f"the target, {start:.4f}, is not below the target's own, {best:.4f}: "
+            "use a finer grid, or a target that moves more mass"
+            for cfg, start, best in zip(cfgs, self.initial_iou, self.best_iou, strict=True)
+            if start >= best
+        }
+        for line in sorted(blind | _thin_manipulators(self.scenes)):
+            _log.warning("%s", line)
 
     def refresh(self, kinds: Sequence[str] | None = None) -> None:
         """Reset the simulator, and update derived data after changes of its scenes, targets or initial
@@ -388,17 +396,15 @@ class Problem:
         return scores_from_iou(float(self.initial_iou[e]), iou, float(self.best_iou[e]))
 
 
-def _warn_of_thin(scenes: Sequence[Scene]) -> None:
-    """Log a warning for manipulators so thin that they fit between grid nodes, where contact is computed."""
-    thin = {
+def _thin_manipulators(scenes: Sequence[Scene]) -> set[str]:
+    """Return warnings of manipulators so thin that they fit between grid nodes, where contact is computed."""
+    return {
         f"manipulators[{number}] is {2 * min(tool.size):.2g} thin, less than half a cell of the grid, "
         f"{scene.dx / 2:.2g}: it passes through bodies; use a finer grid"
         for scene in scenes
         for number, tool in enumerate(scene.manipulators)
         if 4 * min(tool.size) < scene.dx
     }
-    for line in sorted(thin):
-        _log.warning("%s", line)
 
 
 def target_distance(mass: np.ndarray) -> np.ndarray:

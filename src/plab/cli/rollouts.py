@@ -103,8 +103,9 @@ def view(argv: Sequence[str]) -> None:
     to_write(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     from plab.render.rollouts import demonstration, record_with_motion
+    from plab.report.page import render as html
     from plab.results.run_file import replace_file
-    from plab.view.page import gallery, page
+    from plab.view.page import page
 
     if options.gallery:
         pages = []
@@ -114,7 +115,7 @@ def view(argv: Sequence[str]) -> None:
             shown = page(recording, options.every, surface=options.surface)
             replace_file(output.with_name(file), shown)
             pages.append((task, file, recording.score))
-        replace_file(output, gallery(pages))
+        replace_file(output, html("gallery.html", "plab.view", pages=pages))
     else:
         shown = page(record_with_motion(*rollout(options)), options.every, surface=options.surface)
         replace_file(output, shown)

@@ -239,7 +239,7 @@ class EpisodeBatch:
         """
         ranges.one_of("contact", contact, CONTACTS)
         self._randomize, self._success_score = randomize, success_score
-        self._terminates, self._goes_by_stages = terminate_on_success, stages
+        self.terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)
         self._sums_impulses, self._transports = impulses or "impulses" in observe, earth_movers
         problem = Problem(cfgs, make_simulator(cfgs, impulses=self._sums_impulses))
@@ -472,7 +472,7 @@ class EpisodeBatch:
         self._update(observation, measured, kept=list(self.failures))
         observation, info = self._shown()
         reward = self._initial_loss.like(actions) - info["loss"]
-        terminated = _on_host(info["success"]).copy() if self._terminates else np.zeros(self.size, bool)
+        terminated = _on_host(info["success"]).copy() if self.terminates else np.zeros(self.size, bool)
         truncated = self._steps == self.horizon
         self._over = terminated | truncated
         ended = np.flatnonzero(self._over & ~np.asarray(idle))

@@ -146,11 +146,8 @@ def _shape(kind: str, lengths: np.ndarray, box: np.ndarray) -> tuple[str | None,
     if middle > CAPSULE_RATIO * small:
         return "Box", edges, pose_matrix(box[:3], _ALONG[1])
     thick = 0.5 * (small + middle)
-    return (
-        "Capsule",
-        [max(2.0 * (edges[longest] - thick), 1e-6), thick],
-        pose_matrix(box[:3], _ALONG[longest]),
-    )
+    length = max(2.0 * (edges[longest] - thick), 1e-6)
+    return "Capsule", [length, thick], pose_matrix(box[:3], _ALONG[longest])
 
 
 def _rounded(values: Any) -> Any:

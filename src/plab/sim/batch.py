@@ -138,7 +138,8 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
     for e, scene in enumerate(scenes):
         if scene.material_count == 1:
             # A single material belongs to the scene, not to a body.
-            changed.append(replace(scene, **{key: float(table[e, 0]) for key, table in values.items()}))
+            shared: dict[str, Any] = {key: float(table[e, 0]) for key, table in values.items()}
+            changed.append(replace(scene, **shared))
             continue
         bodies = []
         for b, (body, material) in enumerate(zip(scene.bodies, scene.materials, strict=True)):

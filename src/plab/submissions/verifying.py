@@ -316,8 +316,7 @@ class _BestEpisodes:
             with path.open("xb") as file:
                 file.write(encode(Submission(None, ())))
         except FileExistsError:
-            why = "already exists: record into another folder, or remove it"
-            raise SubmissionError(f"{path} {why}") from None
+            raise SubmissionError(f"{path} exists: record into another folder, or remove it") from None
 
     def add(self, actions: np.ndarray, score: float) -> None:
         """Add an episode, given its actions, shape [T, A], and score."""
@@ -360,6 +359,8 @@ def record(env: Env, folder: str | Path) -> Env:
         raise SubmissionError(f"{type(inner).__name__} is not a plab environment")
     if batch.contact != "hard":
         raise SubmissionError("the contact model is soft, but scores need the hard one")
+    if batch.terminates:
+        raise SubmissionError("plans are whole episodes: omit terminate_on_success, which ends them early")
     ledgers = []
     for cfg in batch.configs:
         path = Path(folder).resolve() / f"{configuration_of(cfg).name}{SUFFIX}"

@@ -100,11 +100,6 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
     return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)
 
 
-def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
-    """Return an index of pages, given by name, file and score; the first page is open."""
-    return render("gallery.html", "plab.view", pages=pages)
-
-
 def _plasticine(recording: RecordedRollout, steps: Sequence[int], *, surface: bool) -> Iterator[Any]:
     """Yield each body, as particles or as a surface."""
     scene = recording.scene
