@@ -25,9 +25,7 @@ SEARCH = ("method=cem", "method.population=4", "method.elites=2", "method.iterat
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with a dataset of random scenes, solved by a short search, with images."""
     folder = tmp_path_factory.mktemp("datasets")
-    (folder / "cameras.yaml").write_text(
-        "top: {position: [0.5, 2, 0.5], target: [0.5, 0, 0.5], size: [8, 4]}"
-    )
+    (folder / "cameras.yaml").write_text("top: {position: [0.5,2,0.5], target: [0.5,0,0.5], size: [8, 4]}")
     words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "task.floor_friction=2", *SEARCH]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
@@ -109,9 +107,8 @@ def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path)
 def test_parameters_are_found_from_observations(tmp_path: Path, observation: str) -> None:
     words = ["task=Torus", "variant=1", *COARSE, "observe_particles=30"]
     places = {"front": [0.5, 0.7, 1.3], "side": [1.3, 0.7, 0.5]}
-    cameras = {
-        name: {"position": at, "target": [0.5, 0.1, 0.5], "size": [128, 128]} for name, at in places.items()
-    }
+    shared = {"target": [0.5, 0.1, 0.5], "size": [128, 128]}
+    cameras = {name: {"position": at, **shared} for name, at in places.items()}
     (tmp_path / "cameras.yaml").write_text(json.dumps(cameras))
     looks = ["--cameras", f"{tmp_path}/cameras.yaml"] if observation == "depth" else []
     assert main([*words, "--output", str(tmp_path), "--observe", observation, *looks]) == 0

@@ -109,12 +109,9 @@ def test_what_cannot_be_recorded(tmp_path: Path, env: gymnasium.Env, monkeypatch
     assert "CartPoleEnv" in why(record, gymnasium.make("CartPole-v1"), tmp_path)
     many = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")])
     assert "SyncVectorEnv" in why(record, many, tmp_path)
-    for attribute, value, named in (
-        ("contact", "soft", "soft"),
-        ("terminates", True, "terminate_on_success"),
-    ):
+    for key, value, named in (("contact", "soft", "soft"), ("terminates", True, "terminate_on_success")):
         with monkeypatch.context() as patch:
-            patch.setattr(env.unwrapped.batch, attribute, value)
+            patch.setattr(env.unwrapped.batch, key, value)
             assert named in why(record, env, tmp_path)
     assert not list(tmp_path.iterdir())
     (tmp_path / NAME).write_bytes(b"")

@@ -78,8 +78,7 @@ def test_thin_manipulators_and_targets_without_gain_are_warned_of(caplog) -> Non
     for radius, lines in ((0.01, 1), (0.02, 0)):
         caplog.clear()
         Problem([load_config(["task=Rope", *COARSE, f"task.manipulators.left.size=[{radius}]"])])
-        found = [line for line in caplog.messages if "passes through bodies" in line]
-        assert len(found) == lines
-        assert all(line.startswith("manipulators[0] is 0.02 thin") for line in found)
+        found = [line.partition(",")[0] for line in caplog.messages if "passes through bodies" in line]
+        assert found == lines * ["manipulators[0] is 0.02 thin"]
     Problem([load_config(["task=Torus", *COARSE])])
     assert caplog.messages[-1].startswith("Torus-v1: the score is only 0 or 1, ")
