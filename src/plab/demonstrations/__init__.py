@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from plab.config import Config, build_scene
+from plab.demonstrations.carrying import carry
 from plab.targets import demonstration
 
 __all__ = ["known_actions", "load_actions"]
@@ -33,6 +34,9 @@ def load_actions(task: str, variant: str) -> np.ndarray | None:
 
 def known_actions(cfg: Config) -> np.ndarray | None:
     """Return the best known actions for a configuration, in [-1, 1], shape [T, A]: the script of its target,
-    or recorded actions; None for a geometric target without recorded actions."""
-    scripted = demonstration(build_scene(cfg), cfg.task.target)
-    return load_actions(cfg.task.name, cfg.variant) if scripted is None else scripted
+    recorded actions, or, for a geometric target without them, those of :func:`~carrying.carry`; else None."""
+    scene = build_scene(cfg)
+    if (scripted := demonstration(scene, cfg.task.target)) is not None:
+        return scripted
+    recorded = load_actions(cfg.task.name, cfg.variant)
+    return carry(cfg, scene) if recorded is None else recorded
