@@ -132,7 +132,7 @@ def test_parameters_are_found_from_observations(tmp_path: Path, observation: str
 
 
 def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:
-    assert "method=adam" in told(["task=Move", "variant=random", "seed_scene=3", *COARSE], main)
+    assert "method=adam" in told(["task=Rope", "variant=random", "seed_scene=3", *COARSE], main)
     again = ["task=Move", "variant=1", *COARSE, "--output", str(written)]
     assert "exists" in told(again, main)
     assert "--min-score" not in told([*again, "--name", "a-v0", "--min-score", "2"], main)

@@ -91,6 +91,12 @@ def test_a_scripted_demonstration_reaches_its_target_and_rest_does_not(device):
         assert item.idle.score < 0.5
 
 
+def test_bodies_are_carried_to_the_target_of_a_random_scene(device):
+    cfg = config("TripleMove", "random", "seed_scene=1002", *COARSE, f"sim.device={device}")
+    (item,) = replay([cfg], [known_actions(cfg)])
+    assert item.scores.score > 0.5
+
+
 def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records):
     coarse = [*COARSE[:-1], f"sim.device={device}"]
     better = load_actions("Move", "1")
