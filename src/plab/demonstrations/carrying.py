@@ -33,7 +33,7 @@ def carry(cfg: Config, scene: Scene) -> np.ndarray | None:
         return None
     centres = np.array([body.center for body in scene.bodies])
     ways = np.array([goal["center"] for goal in goals.values()]) - centres
-    tracks, held = [], []
+    tracks, held = list[ActionTrack](), list[int]()
     for tool in tools:
         offsets = centres - np.asarray(tool.position)
         body = int(np.linalg.norm(offsets, axis=1).argmin())
@@ -41,7 +41,7 @@ def carry(cfg: Config, scene: Scene) -> np.ndarray | None:
         tracks.append(ActionTrack(tool))
         tracks[-1].go((1.0 - GRIP * edge) * offsets[body])
         held.append(body)
-    if any(held.count(body) < 2 for body in np.flatnonzero(ways.any(1))):
+    if any(held.count(body) < 2 for body in np.flatnonzero(ways.any(1)).tolist()):
         return None
     together = max(map(len, tracks))
     for track, body in zip(tracks, held, strict=True):
