@@ -85,6 +85,8 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
     kept = np.load(policy_path(finished.path))
     actions = policy(np.stack([kept["mean"]] * 2))
     assert actions.shape == (2, 6) and (np.abs(actions) < 1.0).all()
+    with pytest.raises(ValueError, match="observe_particles"):
+        policy(actions)
     # What hardly changes is not blown up.
     assert kept["variance"].min() == DEVIATION_MIN**2 < kept["variance"].max()
     # Training has changed what it does.

@@ -58,7 +58,7 @@ def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
     assert unseen.main([*words, "--policy", "test_bench:still"]) == 0
     (row,) = read(table)
     assert (row["policy"], row["scenes"]) == ("test_bench:still", "3") and float(row["score"]) < 0.05
-    assert unseen.main(words) == 2
+    assert unseen.main(words) == 2 == unseen.main([str(table), *words])
 
 
 @pytest.mark.nightly

@@ -127,7 +127,8 @@ def test_environments_observe_by_key():
     assert plain["low_depth"].shape == (24, 32, 1) and not depths[plain["low_segmentation"] == 0].any()
     assert 0.018 < depths[plain["low_segmentation"] > 0].std() < 0.022
     assert 0.018 < points[:, :3].std() < 0.022 and not points[:, 3].any()
-    for wrong, named in (({"observe": "sound"}, "sound"), ({"observe": []}, "nothing")):
+    camera = {"cameras": {"top": {"place": 1}}}, r"cameras\.top: .*place"
+    for wrong, named in (({"observe": "sound"}, "sound"), ({"observe": []}, "nothing"), camera):
         with pytest.raises(ValueError, match=named):
             plab.make("Move", overrides=COARSE, **wrong)
 

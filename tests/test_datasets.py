@@ -80,9 +80,8 @@ def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> 
 def cloned(folder: Path, *words: str) -> Config:
     place = f"method.dataset={folder}/plab/Move-v0"
     small = ["method.episodes=18", "method.evaluate_every=9", "method.hidden=[8]", "method.shift=0.1"]
-    return load_config(
-        ["task=Move", "variant=random", "seed_scene=9000", "method=bc", place, *COARSE, *small, *words]
-    )
+    scene = ["task=Move", "variant=random", "seed_scene=9000"]
+    return load_config([*scene, "method=bc", place, *COARSE, *small, *words])
 
 
 def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path) -> None:

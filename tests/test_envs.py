@@ -165,9 +165,8 @@ def test_pictures(env: PlabEnv, vector: PlabVectorEnv, monkeypatch: pytest.Monke
 def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vector: PlabVectorEnv) -> None:
     makers = [lambda e=e: e for e in singles]
     reference = SyncVectorEnv(makers)
-    assert (
-        vector.metadata["autoreset_mode"] == reference.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
-    )
+    modes = [env.metadata["autoreset_mode"] for env in (vector, reference)]
+    assert modes == [AutoresetMode.NEXT_STEP] * 2
     for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
         assert getattr(vector, name) == getattr(reference, name)
     others, tested = DummyVecEnv(makers), PlabVecEnv(vector.batch)

@@ -43,6 +43,6 @@ def test_what_is_executed_is_what_is_judged_and_resumes(words: tuple[str, ...], 
 
 
 def test_mistakes_are_named() -> None:
-    for words, named in ((["method.execute=4"], "execute"), (["method@method.planner=sac"], "planner")):
+    for words, named in ((["method.execute=4"], "execute"), (["method@method.planner=sac"], "planner=sac")):
         with pytest.raises(ConfigError, match=rf"method\.{named}"):
             config("results", *words)

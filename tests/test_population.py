@@ -130,9 +130,8 @@ def library(cfg: Config, observations: np.ndarray, rewards: np.ndarray) -> BaseA
     """Stable-Baselines3's model with the method's numbers and initial policy."""
     m: Any = cfg.method
     truncates = getattr(m, "bootstrap", True)
-    env: VecEnv = DummyVecEnv(
-        [lambda n=n: Script(observations[:, n], rewards[:, n].astype(float), truncates) for n in range(ENVS)]
-    )
+    own = [(observations[:, n], rewards[:, n].astype(float), truncates) for n in range(ENVS)]
+    env: VecEnv = DummyVecEnv([lambda one=one: Script(*one) for one in own])
     if isinstance(m, OffPolicyConfig):
         kind, arguments = SAC, off_policy(m)
         if m.algorithm == "td3":

@@ -213,9 +213,8 @@ def test_sac_begins_with_the_weights_of_the_authors_code() -> None:
 def test_ppo_begins_as_the_profile_says() -> None:
     profiles = {"paper": (0.01, 1.0), "release": (1.0, math.sqrt(2.0))}
     for profile, (policy_gain, value_gain) in profiles.items():
-        policy = first_policy(
-            load_config([*COARSE, "method=ppo", f"method.profile={profile}"]).method, SPACES
-        )
+        cfg = load_config([*COARSE, "method=ppo", f"method.profile={profile}"])
+        policy = first_policy(cfg.method, SPACES)
         # The rows are orthogonal, and as long as the gain.
         for layer, gain in ((policy.action_net, policy_gain), (policy.value_net, value_gain)):
             weight = layer.weight.detach()
@@ -243,14 +242,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, lone, method, step,
 
 
 @pytest.mark.parametrize("method", OWN)
-def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method) -> None:
-    cfgs = configs(tmp_path, method)
+def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method, capsys) -> None:
+    cfgs = configs(tmp_path, method, "progress=true")
     with stopped_at(18, RlRunner, "_step"):
         carry(cfgs)
     assert [len(partial(cfg).iterations) for cfg in cfgs] == [2] * 3
     carry(cfgs)
     for cfg, want in zip(cfgs, lone[method], strict=True):
         assert assert_same_run(cfg, want).provenance["resumed"] == 1
+    # Progress has the loss of the row with as many episodes.
+    shown = dict(re.findall(r" (\d+)/\d+, .*loss (\S+) ", capsys.readouterr().out))
+    means = sum(want.iterations.set_index("episodes")["loss"] for want in lone[method]) / 3
+    assert shown == {str(n): f"{loss:.5g}" for n, loss in means.items()}
 
 
 def test_runs_that_stand_at_different_evaluations_go_on_to_the_same_numbers(tmp_path, lone) -> None:
@@ -366,8 +369,7 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
     assert [one.provenance.get("broken_evaluations") for one in (judged, taught, other)] == [1, None, None]
     assert np.isfinite(taught.iterations[1:].to_numpy()).all()
     rows, whole = judged.iterations["loss"], alone[0].iterations["loss"]
-    assert judged.best_iteration != 1
-    assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
+    assert judged.best_iteration != 1 and rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
     for one in (judged, taught):
         assert any(str(one.path) in record.getMessage() for record in caplog.records)
 
@@ -375,10 +377,10 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
 def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
     """All episodes of the second run diverge, and the third run's networks become non-finite."""
     cfgs = configs(tmp_path, "sac")
-    intact = RlRunner.train
+    intact = RlRunner.cycle
 
-    def train(self: RlRunner, episodes: int) -> None:
-        intact(self, episodes)
+    def cycle(self: RlRunner) -> None:
+        intact(self)
         if self.episodes == 12:
             with torch.no_grad():
                 for parameter in self.stacks[-1].parameters():
@@ -386,7 +388,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
 
     with monkeypatch.context() as patch:
         break_steps(patch, range(12))
-        patch.setattr(RlRunner, "train", train)
+        patch.setattr(RlRunner, "cycle", cycle)
         ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "failed"]
     assert ended[1].message.startswith("iteration 1: all 6 ")

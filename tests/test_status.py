@@ -82,6 +82,8 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     (run,) = find(folder, "method=cem").running.itertuples()
     assert (run.done, run.total, run.score, run.left) == (4, 4, 1.0, 0.0)
     lock.release()
+    (run,) = find(folder, "method=ppo").runs.itertuples()
+    assert (run.state, run.done, run.total) == ("interrupted", 66, 100) and np.isnan(run.rate)
 
 
 def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
@@ -127,8 +129,7 @@ def test_forms_of_output(folder: Path, told, capsys) -> None:
     assert known["workers"] == 0 and len(known["runs"]) == 3 and len(known["unreadable"]) == 1
     assert main(["--csv", *arguments]) == 0
     (row,) = csv.DictReader(io.StringIO(capsys.readouterr().out))
-    names = ("task", "method", "expected", "done", "failed")
-    assert [row[name] for name in names] == ["Rope", "adam", "3", "2", "1"]
+    assert row == row | {"task": "Rope", "method": "adam", "expected": "3", "done": "2", "failed": "1"}
     for wrong in ("tusk=Rope", "/nowhere/at/all"):
         assert wrong in told([wrong], main)
 

@@ -61,7 +61,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     seen = screen.getvalue()
     assert "Rope-v1 cem seed 0 build" in seen and "Rope-v1 cem seed 0 final evaluation" in seen
     assert re.search(r"compiling \w+", seen)
-    assert re.search(r"loss [\d.]+ \w+ score \d\.\d{3} best [\d.]+", seen)
+    assert re.search(r"loss [\d.]+ \w+ score \d\.\d{3} best score [\d.]+", seen)
     *_, score, hint = capsys.readouterr().out.splitlines()
     assert score.startswith("finished: score 0.0000, results/Rope-v1/cem/seed0-")
     assert f"plab render {score.rpartition(' ')[2]};" in hint

@@ -109,9 +109,8 @@ def test_success_ends_an_episode_if_asked_to(alone) -> None:
     assert np.isnan(env.reset()[1]["earth_movers"]).all()
     _, _, terminated, truncated, info = env.step(np.zeros((2, 6)))
     assert terminated.all() and not truncated.any() and info["success"].all()
-    exact = map(
-        earth_movers_distance, env.batch.problem.simulator.mass_tensor(), env.batch.problem.target_mass
-    )
+    problem = env.batch.problem
+    exact = map(earth_movers_distance, problem.simulator.mass_tensor(), problem.target_mass)
     assert info["earth_movers"] == pytest.approx(list(exact), abs=0.002)
     env.close()
     assert alone[0].reset()[1]["success"] is False
@@ -158,9 +157,8 @@ def test_goals_agree_with_hindsight() -> None:
     first, _ = env.reset(seed=0)
     assert env.observation_space.contains(first) and first["achieved_goal"].sum() == pytest.approx(1.0)
     seen, reward, *_ = env.step(np.ones(6))
-    again = env.compute_reward(
-        np.stack([seen["achieved_goal"]] * 2), np.stack([seen["desired_goal"]] * 2), {}
-    )
+    pairs = (np.stack([seen[name]] * 2) for name in ("achieved_goal", "desired_goal"))
+    again = env.compute_reward(*pairs, {})
     assert again == pytest.approx([reward] * 2) and -1.0 <= reward < 0.0
     assert env.compute_reward(seen["achieved_goal"], seen["achieved_goal"], {}) == 0.0
     # The goal is where the target is, in every episode.

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, str], None]
-"""Function of the number of finished steps and a short status text."""
+"""Function of the number of finished steps and a short status text, which is empty between measurements."""
 
 Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
 """Context that reports the name of each kernel being compiled to a function, and an empty name afterwards,
@@ -51,13 +51,18 @@ def show_progress(
         bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()
         columns = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
         with Progress(next(columns), *bar, *columns, console=console, transient=not total) as bars:
-            task = bars.add_task(title, total=total, completed=start, text="")
+            task, shown = bars.add_task(title, total=total, completed=start, text=""), ""
 
             def note(kernel: str) -> None:
-                bars.update(task, text=f"compiling {kernel}" if kernel else "", refresh=bool(kernel))
+                bars.update(task, text=f"compiling {kernel}" if kernel else shown, refresh=bool(kernel))
+
+            def report(done: int, text: str) -> None:
+                nonlocal shown
+                shown = text or shown
+                bars.update(task, completed=done, text=shown)
 
             with watch(note):
-                yield lambda done, text: bars.update(task, completed=done, text=text)
+                yield report
     elif enabled and total is not None:
         yield _plain(title, start, total, plain_every)
     else:
@@ -80,10 +85,10 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
         nonlocal last
         bars.update(task.id, completed=done)
         # A step may be a batch of episodes and skip multiples of the interval.
-        if last == start or done // every > last // every or done == total:
+        if text and (last == start or done // every > last // every or done == total):
             seconds = task.time_remaining
             left = "started" if seconds is None else f"{timedelta(seconds=seconds)} left"
-            print(", ".join(filter(None, (f"{title} {done}/{total}", left, text))), flush=True)
-        last = done
+            print(f"{title} {done}/{total}, {left}, {text}", flush=True)
+        last = done if text else last
 
     return report

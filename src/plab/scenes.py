@@ -676,11 +676,6 @@ class Camera:
         """Focal length [pixels]."""
         return self.size[1] / 2 / math.tan(math.radians(self.field_of_view) / 2)
 
-    def intrinsics(self) -> np.ndarray:
-        """Return the matrix from camera coordinates (x right, y down, z forward) to pixels, shape [3, 3]."""
-        width, height = self.size
-        return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
-
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points of the scene onto the image.
 
@@ -703,3 +698,14 @@ class Camera:
         y = (height / 2 - np.arange(height) - 0.5) / self.focal_length
         rays = np.stack([*np.meshgrid(x, y), -np.ones((height, width))], axis=-1) @ self.axes()
         return np.array(self.position) + depth[..., None] * rays
+
+
+def named_cameras(given: Mapping[str, Any]) -> dict[str, Camera]:
+    """Return cameras by name, given cameras or their attributes; SceneError names an invalid camera."""
+    cameras = {}
+    for name, own in given.items():
+        try:
+            cameras[name] = own if isinstance(own, Camera) else Camera(**own)
+        except (SceneError, TypeError, ValueError) as error:
+            raise SceneError(f"cameras.{name}: {str(error).removeprefix('Camera.__init__() ')}") from None
+    return cameras

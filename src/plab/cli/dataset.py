@@ -36,7 +36,7 @@ from plab.envs.observations import mapped, spaces
 from plab.errors import ArgumentError, print_error
 from plab.problem import build_scenes
 from plab.results import read
-from plab.scenes import Camera
+from plab.scenes import Camera, SceneError, named_cameras
 
 REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVATION_KEYS)
 """Keys that apply to the replay of results; other keys select runs."""
@@ -109,9 +109,8 @@ def main(argv: Sequence[str]) -> None:
 
 def _cameras(path: Path) -> dict[str, Camera]:
     try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {name: Camera(**own) for name, own in given.items()}
-    except (OSError, yaml.YAMLError, AttributeError, TypeError) as error:
+        return named_cameras(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, yaml.YAMLError, AttributeError, SceneError) as error:
         raise ArgumentError(f"--cameras {path}: {' '.join(str(error).split())}") from None
 
 
@@ -206,8 +205,9 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
         batch.renew([one.cfg for one in filled])
         observation, info = batch.reset()
         actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
-        if actions.shape[1] != batch.horizon:
-            raise DatasetError(f"actions of {actions.shape[1]} steps for sim.horizon={batch.horizon}")
+        if (length := actions.shape[1]) != batch.horizon:
+            known = f"the known actions of {part[0].cfg.task.name} have {length} steps"
+            raise DatasetError(f"{known}: set sim.horizon={length} (got {batch.horizon})")
         steps = [batch.step(actions[:, t], strict=False) for t in range(batch.horizon)]
         seen = [observation, *(step.observation for step in steps)]
         infos, failures = [info, *(step.info for step in steps)], steps[-1].failures

@@ -82,7 +82,7 @@ def show(found: Survey) -> None:
     for run in found.runs.itertuples():
         if run.state == "running":
             left = f"{run.done}/{run.total}, {duration(run.left * run.together)} left"
-            lines.append(f"running: {_name(run)}: {left if run.total else 'starting'}")
+            lines.append(f"running: {_name(run)}: {left if run.total else f'{run.done} rows'}")
         elif run.state == "failed":
             lines.append(f"failed: {_name(run)}: {run.message}")
     lines += _sums(found)

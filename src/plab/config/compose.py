@@ -296,7 +296,10 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
             stages[name] = _typed_method(stages[name], f"{path}.stages.{name!s}")
     if isinstance(planner := method.get("planner"), DictConfig):
         method.planner = _typed_method(planner, f"{path}.planner")
-    kind = family(str(method.family)).config_type(method.get("algorithm"))
+    kind: Any = family(str(method.family)).config_type(method.get("algorithm"))
+    # Planners and gradient methods sample initial actions.
+    if path.endswith(".planner") and "action_init" not in kind.__dataclass_fields__:
+        raise ConfigError(f"{path}={method.name} cannot plan: choose cem, mppi, cmaes, multistart, adam, gd")
     # Below a root, so that error messages name the full key.
     root = OmegaConf.create({})
     OmegaConf.update(root, path, OmegaConf.structured(kind))

@@ -13,12 +13,11 @@ from plab.files import pinned
 from plab.scenes import (
     MATERIAL_KEYS,
     Body,
-    Camera,
     Manipulator,
-    SceneError,
     find_law,
     link_manipulators,
     make_body,
+    named_cameras,
 )
 from plab.targets import TargetError, make_recipe
 
@@ -304,11 +303,8 @@ class TaskConfig(ranges.Section):
             from plab.config.randomization import ranges_of
 
             ranges_of(self)
-        for name, camera in self.cameras.items():
-            try:
-                Camera(**camera)
-            except (SceneError, TypeError, ValueError) as error:
-                raise ConfigError(f"{path}.cameras.{name}: {error}") from None
+        with located(path):
+            named_cameras(self.cameras)
 
     def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
         """Return the scene's bodies, see :meth:`BodyConfig.build`; ConfigError names an invalid key."""

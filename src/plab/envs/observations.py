@@ -12,7 +12,7 @@ from plab.config import Config, ranges
 from plab.errors import ArgumentError
 from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
-from plab.scenes import Camera, Scene
+from plab.scenes import Camera, Scene, named_cameras
 from plab.sim import Simulator
 from plab.sim.cameras import FIRST_BODY, CameraSensor
 from plab.sim.tensors import Constants, on_device
@@ -173,9 +173,7 @@ class Sensors:
         self._pictures = [name for name in self.names if name in PICTURES]
         if not cameras:
             cameras = DEFAULT_CAMERAS if self._pictures and cameras is None else {}
-        self.cameras = {
-            name: one if isinstance(one, Camera) else Camera(**one) for name, one in cameras.items()
-        }
+        self.cameras = named_cameras(cameras)
         if not self.names or (self._pictures and not self.cameras):
             raise ArgumentError("nothing is observed: name observations, and cameras for pictures")
         looking = self._pictures or "points" in self.names

@@ -75,7 +75,7 @@ def _frames(recording: RecordedRollout, every: int) -> Iterator[tuple[int, dict[
             clay = _merged(enumerate(body_meshes(scene, recording.x[step])), "body")
             tools = _merged(rigid, "manipulator")
             yield step, {"plasticine": clay, "manipulators": tools}
-            report(step, "")
+            report(step, f"step {step}")
 
 
 def _merged(meshes: Iterable[tuple[int, pv.PolyData]], name: str) -> pv.PolyData:

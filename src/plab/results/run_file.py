@@ -171,10 +171,12 @@ def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(f"loss_{name}" for name, weight in config["method"]["loss_weights"].items() if weight)
 
 
-def row_count(method: Mapping[str, Any]) -> int | None:
+def row_count(method: Mapping[str, Any], horizon: int) -> int | None:
     """Return the number of rows of a finished run, if the ``method`` section determines it."""
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
+    if "execute" in method:
+        return math.ceil(horizon / method["execute"])
     return method.get("iterations")
 
 

@@ -90,18 +90,10 @@ class AgentRandom:
     def draw(self, kind: str, *shape: int) -> Tensor:
         """Sample numbers, shape [agent, *shape]: ``normal``, ``uniform`` in [-1, 1), ``integers`` in [0,
         :data:`LARGEST`), or a ``permutation`` of the integers below the only entry of ``shape``."""
-        drawn = []
-        for generator in self._generators:
-            options: dict[str, Any] = {"generator": generator, "device": self._device}
-            if kind == "normal":
-                drawn.append(torch.randn(shape, **options))
-            elif kind == "uniform":
-                drawn.append(torch.rand(shape, **options) * 2.0 - 1.0)
-            elif kind == "integers":
-                drawn.append(torch.randint(LARGEST, shape, **options))
-            else:
-                drawn.append(torch.randperm(*shape, **options))
-        return torch.stack(drawn)
+        kinds: dict[str, Any] = {"normal": torch.randn, "uniform": torch.rand, "permutation": torch.randperm}
+        kinds["integers"] = lambda *shape, **options: torch.randint(LARGEST, shape, **options)
+        drawn = [kinds[kind](*shape, generator=own, device=self._device) for own in self._generators]
+        return torch.stack(drawn) * 2.0 - 1.0 if kind == "uniform" else torch.stack(drawn)
 
     def block(self, use: str, kind: str, *shape: int) -> Tensor:
         """Return the next entry, shape [agent, *shape], of a named block of random numbers, which is refilled
@@ -555,10 +547,6 @@ class OffPolicyAgents(Agents):
     def noise(self) -> Tensor:
         """Sample standard normal noise for the environments' actions, shape [agent, env, action]."""
         return self.random.block("noise", "normal", self.sizes.envs, self.sizes.actions)
-
-    def numbers(self) -> Tensor:
-        """Sample the indices of an update's transitions, shape [agent, row]."""
-        return self.random.block("numbers", "integers", self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Return the actions used before learning starts, given uniformly random actions."""

@@ -9,7 +9,6 @@ Any planner or gradient method can plan from the current state; its keys are in 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -19,14 +18,7 @@ import numpy as np
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family, family
 from plab.plugins import torch
-from plab.runners.planner import (
-    Asking,
-    Planner,
-    PlannerConfig,
-    PlannerRunner,
-    Request,
-    make_planner,
-)
+from plab.runners.planner import Asking, Planner, PlannerRunner, Request, make_planner
 from plab.runners.runner import Step, Track
 from plab.runners.trajectory import TrajectoryConfig
 
@@ -50,8 +42,6 @@ class MpcConfig(MethodConfig):
 
     def check(self, path: str) -> None:
         super().check(path)
-        if not isinstance(self.planner, PlannerConfig | TrajectoryConfig):
-            raise ConfigError(f"{path}.planner cannot plan: choose cem, mppi, cmaes, multistart, adam or gd")
         if self.execute > self.window:
             raise ConfigError(
                 f"{path}.execute must be at most {path}.window={self.window} (got {self.execute})"
@@ -109,10 +99,6 @@ class MpcRunner(PlannerRunner):
             self._execute(np.array(state["executed"]))
             found = np.array(state["found"])
         self._found = torch.as_tensor(found, device=self._device)
-
-    def iterations(self, track: Track) -> int:
-        """Return the number of plans per episode."""
-        return math.ceil(track.cfg.sim.horizon / self.method.execute)
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""

@@ -22,6 +22,8 @@ from omegaconf import OmegaConf
 
 from plab.config import MethodConfig, ranges
 from plab.config.families import family, known_family
+from plab.config.run import SUFFIX
+from plab.errors import ArgumentError
 from plab.files import read_arrays
 from plab.plugins import torch
 from plab.results import ResultsError
@@ -152,6 +154,12 @@ class Policy:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions, shape [env, action], for observations from environments, shape [env, entry]."""
+        entries, wanted = np.shape(observation)[-1], cast("Box", self.network.observation_space).shape[0]
+        if entries != wanted:
+            raise ArgumentError(
+                f"observations have {entries} entries, those of the policy's training {wanted}: "
+                "use its task, observe_particles and observe_target"
+            )
         if self.mean is not None and self.variance is not None:
             scaled = (observation - self.mean) / np.sqrt(self.variance + EPSILON)
             observation = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
@@ -188,8 +196,10 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
 
     Raises:
         ResultsError: If the policy is missing, its file is damaged, or the external module of its family has
-            not been imported.
+            not been imported; or ``result`` is another file.
     """
+    if Path(result).suffix != SUFFIX:
+        raise ResultsError(f"{result} is not a result file: name the run's {SUFFIX} file")
     path = policy_path(Path(result))
     if not path.exists():
         why = "sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"

@@ -87,7 +87,7 @@ class RlRunner(PolicyRunner):
         for _ in range(self._cycle_steps // self._envs):
             self._step()
             if self.steps % (self._envs * self._horizon) == 0:
-                self.report(self.episodes, self._shown)
+                self.report(self.episodes, "")
 
     def decide(self, observations: Tensor) -> Tensor:
         parts = self._parts(observations.to(self._device).unsqueeze(1))

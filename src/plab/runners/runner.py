@@ -276,7 +276,7 @@ class Runner:
         self.cache, self._note = cache, note
         self.report = lambda done, text: None
         self._family = family(tracks[0].cfg.method.family)
-        self._phase, self._since, self._timed, self._shown = "", 0.0, self.tracks, ""
+        self._phase, self._since, self._timed = "", 0.0, self.tracks
 
     # ------------------------------------------------------------------------------------------------ hooks
 
@@ -294,7 +294,7 @@ class Runner:
 
     def iterations(self, track: Track) -> int:
         """Return the number of a run's iterations."""
-        return cast(int, row_count(asdict(track.cfg.method)))
+        return cast(int, row_count(asdict(track.cfg.method), track.cfg.sim.horizon))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Make the next iteration of unfinished runs; by default :attr:`step` of each. Yield the successful
@@ -328,10 +328,14 @@ class Runner:
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
         """Return the text of progress after an iteration, given the means of its rows by column."""
         contact = " and ".join(dict.fromkeys(track.contact for track in tracks))
+        text = f"loss {means['loss']:.5g} {contact} score {means['score']:.3f}"
+        if any(track.best_actions is None for track in tracks):
+            # Incomplete episodes of mpc are never the best.
+            return text
         best = f"loss {np.mean([track.best_loss for track in tracks]):.5g}"
         if self._family.ranking == "score":
             best = f"score {np.mean([t.best_score for t in self.tracks if t.error is None]):.3f}"
-        return f"loss {means['loss']:.5g} {contact} score {means['score']:.3f} best {best}"
+        return f"{text} best {best}"
 
     # ------------------------------------------------------------------------------------ for use in hooks
 
@@ -397,8 +401,8 @@ class Runner:
                                 rows[track] = row = track.record(step, columns, seconds)
                         if rows:
                             means = {key: np.mean([own[key] for own in rows.values()]).item() for key in row}
-                            self._shown = "mean " * (len(rows) > 1) + self.summary_line(means, list(rows))
-                            self.report(self.extent()[0], self._shown)
+                            text = "mean " * (len(rows) > 1) + self.summary_line(means, list(rows))
+                            self.report(self.extent()[0], text)
             finally:
                 self.enter("")
                 self.close()

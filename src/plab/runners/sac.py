@@ -77,7 +77,8 @@ class SacAgents(OffPolicyAgents):
             return torch.tanh(self._gaussian(observations)[0])
 
     def update(self) -> None:
-        shape, numbers = (self.method.batch_size, self.sizes.actions), self.numbers()
+        shape = self.method.batch_size, self.sizes.actions
+        numbers = self.random.block("numbers", "integers", self.method.batch_size)
         noise = [self.random.block(use, "normal", *shape) for use in ("actions", "next actions")]
         self._note(self._captured(self.descent, numbers, *noise))
 

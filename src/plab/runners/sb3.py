@@ -112,7 +112,7 @@ class Sb3Runner(PolicyRunner):
             rewards = np.array([info["episode"]["r"] for info in infos])
             self.note(train_reward=rewards, train_score=np.array([info["score"] for info in infos]))
             self.broken[0] += [info["failure"] for info in infos if "failure" in info]
-            self.report(self.episodes, self._shown)
+            self.report(self.episodes, "")
         return True
 
     def losses(self) -> list[dict[str, float]]:

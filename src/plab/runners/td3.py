@@ -80,8 +80,8 @@ class Td3Agents(OffPolicyAgents):
     def update(self) -> None:
         """Update the critics, and actor and targets if they are due."""
         due = self.updates % self.method.policy_delay == 0
-        numbers, shape = self.numbers(), (self.method.batch_size, self.sizes.actions)
-        noise = self.random.block("smoothing", "normal", *shape)
+        numbers = self.random.block("numbers", "integers", self.method.batch_size)
+        noise = self.random.block("smoothing", "normal", self.method.batch_size, self.sizes.actions)
         self._note(self._captured(self.descent, numbers, noise, due=due))
 
     def descent(self, numbers: Tensor, noise: Tensor, *, due: bool) -> Tensor:

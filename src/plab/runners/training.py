@@ -149,7 +149,7 @@ class PolicyRunner(Runner, ABC):
 
     @abstractmethod
     def cycle(self) -> None:
-        """Train for one cycle and report the progress."""
+        """Train for one cycle and report the episodes, without a text."""
 
     def decide(self, observations: Tensor) -> Tensor:
         """Return the actions of the deterministic policies, shape [run, A], given one observation each, shape
@@ -199,11 +199,6 @@ class PolicyRunner(Runner, ABC):
         """Number of complete episodes per policy so far."""
         return self.steps // self._horizon
 
-    def train(self, episodes: int) -> None:
-        """Train until each policy has completed a number of episodes, or all transitions."""
-        while self.episodes < episodes and self.steps < self.total_steps:
-            self.cycle()
-
     def context(self) -> AbstractContextManager[Any]:
         # Large first layers dominate the time of an update on a GPU.
         tf32 = self.tf32 and self.method.torch_device == "cuda"
@@ -244,8 +239,9 @@ class PolicyRunner(Runner, ABC):
         # The first evaluation, of the initial policies, compiles the kernels.
         if tracks[0].iteration > 0:
             self.enter("optimise")
-            last = tracks[0].run.result.columns["episodes"][-1]
-            self.train(int(last) + self.method.evaluate_every)
+            until = int(tracks[0].run.result.columns["episodes"][-1]) + self.method.evaluate_every
+            while self.episodes < until and self.steps < self.total_steps:
+                self.cycle()
             self.enter("evaluate")
         measures, actions, failures = evaluate(self._judge, self.decide)
         columns = self._family.columns
@@ -389,7 +385,7 @@ class ActorRunner(PolicyRunner):
     def cycle(self) -> None:
         self.learn(1.0 - self.steps / self.total_steps)
         self.steps += self._cycle_steps
-        self.report(self.episodes, self._shown)
+        self.report(self.episodes, "")
 
     @abstractmethod
     def learn(self, rate_left: float) -> None:

@@ -144,14 +144,15 @@ def _state(row: Row) -> str:
 def _described(row: Row, state: str) -> dict[str, Any]:
     """Return the columns of a run that has files."""
     values, method = row.values, row.config["method"]
-    total = row_count(method) or method.get("episodes") or 0
+    wanted, episodes = row_count(method, row.config["sim"]["horizon"]), method.get("episodes")
+    total = wanted or episodes or 0
     known = {name: values[name] for name in ("score", "seconds", "path")}
     message = printable(values["message"]) if state == "failed" else ""
     known |= {"state": state, "message": message, "total": total, "done": total * (state == "done")}
-    return known | (_measured(row, total, state) if state != "done" else {})
+    return known | (_measured(row, state, total, by_rows=total != episodes) if state != "done" else {})
 
 
-def _measured(row: Row, total: int, state: str) -> dict[str, Any]:
+def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, Any]:
     """Return progress of an unfinished run, and speed and remaining time while it is running."""
     try:
         with opened(row.path) as file:
@@ -164,9 +165,10 @@ def _measured(row: Row, total: int, state: str) -> dict[str, Any]:
     count = len(table.get("seconds", ()))
     if not count:
         return known
-    done = table["episodes"] if "train_reward" in table else range(1, count + 1)
+    done = range(1, count + 1) if by_rows else table["episodes"]
     best = min(summary["best_iteration"], count - 1)
-    known |= {"done": int(done[-1]), "score": float(table["score"][best])}
+    # Runs complete whole cycles of episodes.
+    known |= {"done": min(int(done[-1]), total or count), "score": float(table["score"][best])}
     if "kept_score" in table and table["kept_score"][-1] >= 0.0:
         known["score"] = float(table["kept_score"][-1])
     if row.config["method"]["family"] == "planner" and known["score"] >= SOLVED:
@@ -174,9 +176,9 @@ def _measured(row: Row, total: int, state: str) -> dict[str, Any]:
         return known | {"done": total, "left": 0.0}
     # The first row of a process compiles the kernels.
     recent = min(_RECENT_ROWS, count - 1)
-    if state == "running" and recent and known["done"] > int(done[-1 - recent]):
-        rate = (known["done"] - int(done[-1 - recent])) / max(float(table["seconds"][-recent:].sum()), 1e-9)
-        known |= {"left": max((total - known["done"]) / rate, 0.0), "rate": rate / together}
+    if state == "running" and total and recent and int(done[-1]) > int(done[-1 - recent]):
+        rate = (int(done[-1]) - int(done[-1 - recent])) / max(float(table["seconds"][-recent:].sum()), 1e-9)
+        known |= {"left": (total - known["done"]) / rate, "rate": rate / together}
     return known
 
 

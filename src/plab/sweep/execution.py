@@ -201,7 +201,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     if not own.batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of different lengths would leave environments idle, and agents are trained in lockstep.
-    alike = method if own.in_step else row_count(method)
+    alike = method if own.in_step else row_count(method, cfg.sim.horizon)
     return [*kind, alike, *scene_kind(scene)]
 
 
