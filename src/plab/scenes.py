@@ -676,6 +676,11 @@ class Camera:
         """Focal length [pixels]."""
         return self.size[1] / 2 / math.tan(math.radians(self.field_of_view) / 2)
 
+    def intrinsics(self) -> np.ndarray:
+        """Return the matrix from camera coordinates (x right, y down, z forward) to pixels, shape [3, 3]."""
+        width, height = self.size
+        return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points of the scene onto the image.
 
