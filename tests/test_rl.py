@@ -250,10 +250,10 @@ def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method
     carry(cfgs)
     for cfg, want in zip(cfgs, lone[method], strict=True):
         assert assert_same_run(cfg, want).provenance["resumed"] == 1
-    # Progress has the loss of the row with as many episodes.
-    shown = dict(re.findall(r" (\d+)/\d+, .*loss (\S+) ", capsys.readouterr().out))
-    means = sum(want.iterations.set_index("episodes")["loss"] for want in lone[method]) / 3
-    assert shown == {str(n): f"{loss:.5g}" for n, loss in means.items()}
+    # Progress has the reward of the row with as many episodes.
+    shown = dict(re.findall(r" (\d+)/\d+, .*reward (\S+) ", capsys.readouterr().out))
+    means = sum(want.iterations.set_index("episodes")["reward"] for want in lone[method]) / 3
+    assert shown == {str(n): f"{reward:.4g}" for n, reward in means.items()}
 
 
 def test_runs_that_stand_at_different_evaluations_go_on_to_the_same_numbers(tmp_path, lone) -> None:

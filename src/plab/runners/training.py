@@ -280,6 +280,9 @@ class PolicyRunner(Runner, ABC):
         """Return the numbers of finished and total episodes, and of episodes between evaluations."""
         return self.episodes, self.total_steps // self._horizon, self.method.evaluate_every
 
+    def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
+        return f"reward {means['reward']:.4g} hard score {means['score']:.3f}"
+
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation; sampling has ended."""
         save_policy(track.run.path, self.method, self.policy(track.number))
