@@ -253,7 +253,7 @@ def test_scores(folder: Path, told, capsys) -> None:
 def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told) -> None:
     pack(folder, folder.parent / "all.plab.zip.xz")
     for source in (folder, folder.parent / "all.plab.zip.xz"):
-        options = Namespace(what=[str(source), "task=Rope"], output=None)
+        options = Namespace(config_dir=None, what=[str(source), "task=Rope"], output=None)
         assert resolve_rollout(options, ".png") == Path("Rope-v1-adam-seed1.png")
         assert read(options.source).config["seed"] == 1
     assert str(folder) in told([str(folder), "seed=3"], render)
