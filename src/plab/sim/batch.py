@@ -136,17 +136,18 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
         values[name] = np.broadcast_to(table, counts)
     changed = []
     for e, scene in enumerate(scenes):
-        if scene.material_count == 1:
-            # A single material belongs to the scene, not to a body.
-            shared: dict[str, Any] = {key: float(table[e, 0]) for key, table in values.items()}
-            changed.append(replace(scene, **shared))
-            continue
+        # A single material belongs to the scene, not to a body.
+        single = scene.material_count == 1
         bodies = []
         for b, (body, material) in enumerate(zip(scene.bodies, scene.materials, strict=True)):
             own = {key: float(table[e, b]) for key, table in values.items() if key in material.kind.keys}
             fields: dict[str, Any] = {key: own.pop(key) for key in MATERIAL_KEYS if key in own}
+            fields = dict.fromkeys(fields) if single else fields
             bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **own}))
-        changed.append(replace(scene, bodies=tuple(bodies)))
+        shared: dict[str, Any] = {
+            key: float(values[key][e, 0]) for key in MATERIAL_KEYS if single and key in values
+        }
+        changed.append(replace(scene, bodies=tuple(bodies), **shared))
     return tuple(changed)
 
 
