@@ -25,10 +25,7 @@ from suite import DEVICE
 os.environ["PLAB_TRACEBACK"] = "1"
 
 
-OF_ANY_DEVICE = (
-    *("tests/test_simulator.py", "tests/test_mixed_laws.py", "tests/test_mixed_materials.py"),
-    "tests/verification/",
-)
+OF_ANY_DEVICE = ("tests/test_simulator.py", "tests/test_mixed_", "tests/verification/")
 """Tests of the simulator that need a GPU when ``PLAB_TEST_DEVICE`` is cuda."""
 
 MOVE = """rl envs wrappers actors planners tutorials cameras datasets demonstrations mpc draws population
