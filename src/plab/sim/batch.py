@@ -65,7 +65,7 @@ def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
     return np.array(poses, np.float64).reshape(len(scenes), len(scenes[0].manipulators), 8)
 
 
-def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "particles") -> np.ndarray:
+def checked_positions(x: ArrayLike, scene: Scene, label: str = "particles") -> np.ndarray:
     """Return particle positions, shape [..., particle, 3], as float64.
 
     Raises:
@@ -75,9 +75,9 @@ def checked_positions(x: ArrayLike, particles: int, nodes: int, label: str = "pa
     x = np.asarray(x, np.float64)
     if x.ndim < 2 or x.shape[-1] != 3:
         raise ArgumentError(f"{label} have shape {list(x.shape)}, not [particle, 3]")
-    if x.shape[-2] != particles:
-        raise ArgumentError(f"{label} are {x.shape[-2]}, but the scene has {particles}")
-    low, high = -0.5 / nodes, 1.0 - 1.5 / nodes
+    if x.shape[-2] != scene.particle_count:
+        raise ArgumentError(f"{label} are {x.shape[-2]}, but the scene has {scene.particle_count}")
+    low, high = -0.5 / scene.grid_size, 1.0 - 1.5 / scene.grid_size
     # NaN must fail this comparison, too.
     inside = np.all((x >= low) & (x < high), axis=-1)
     if not inside.all():
@@ -136,18 +136,17 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
         values[name] = np.broadcast_to(table, counts)
     changed = []
     for e, scene in enumerate(scenes):
-        # A single material belongs to the scene, not to a body.
-        single = scene.material_count == 1
+        # A single material of several bodies belongs to the scene.
+        if not any(body.own_material for body in scene.bodies):
+            shared: dict[str, Any] = {key: float(table[e, 0]) for key, table in values.items()}
+            changed.append(replace(scene, **shared))
+            continue
         bodies = []
         for b, (body, material) in enumerate(zip(scene.bodies, scene.materials, strict=True)):
             own = {key: float(table[e, b]) for key, table in values.items() if key in material.kind.keys}
             fields: dict[str, Any] = {key: own.pop(key) for key in MATERIAL_KEYS if key in own}
-            fields = dict.fromkeys(fields) if single else fields
             bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **own}))
-        shared: dict[str, Any] = {
-            key: float(values[key][e, 0]) for key in MATERIAL_KEYS if single and key in values
-        }
-        changed.append(replace(scene, bodies=tuple(bodies), **shared))
+        changed.append(replace(scene, bodies=tuple(bodies)))
     return tuple(changed)
 
 

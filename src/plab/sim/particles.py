@@ -14,8 +14,8 @@ import numpy as np
 
 from plab.sim.compiler import ti
 from plab.sim.state import State
-from plab.sim.storage import AT_C, AT_F, AT_V, STATE
-from plab.sim.tensors import copy_numbers, from_host
+from plab.sim.storage import AT_C, AT_F, AT_V, BYTES, STATE
+from plab.sim.tensors import NUMPY_TYPES, copy_numbers, from_host
 
 STAMP_MAX = 2**31 - 2**20
 
@@ -85,8 +85,8 @@ class Particles:
         places: Places in all environments, padding included.
     """
 
-    def __init__(self, engine: Any, numpy_real: type) -> None:
-        """Allocate; call :meth:`start_order` next. ``numpy_real`` is NumPy's type of numbers."""
+    def __init__(self, engine: Any) -> None:
+        """Allocate; call :meth:`start_order` next."""
         self.engine = engine
         self.places = engine.batch * engine.tiles * engine.lanes
         self.current = self.array(1)
@@ -96,7 +96,6 @@ class Particles:
             # Destinations of state and order when particles are sorted.
             self._spare, self._spare_numbers = self.array(1), self.order_array(1)
             self._moves = self.order_array(1)
-        self._numpy_real = numpy_real
         self._stamp = 0
 
     def array(self, slots: int) -> ti.Ndarray:
@@ -113,7 +112,7 @@ class Particles:
     @property
     def slot_bytes(self) -> int:
         """Size of one state of all environments [bytes]."""
-        return self.slot_entries * np.dtype(self._numpy_real).itemsize
+        return self.slot_entries * BYTES[self.engine.real]
 
     # -- order --------------------------------------------------------------------------------------
 
@@ -226,7 +225,7 @@ class Particles:
         rest."""
         engine = self.engine
         b, n = engine.batch, engine.particles
-        flat: np.ndarray = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
+        flat = np.zeros((b, engine.tiles * engine.lanes, STATE), NUMPY_TYPES[engine.real])
         flat[:, :, [AT_F, AT_F + 4, AT_F + 8]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)

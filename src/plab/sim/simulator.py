@@ -139,14 +139,13 @@ class Simulator:
         self.terms: tuple[Term, ...] = tuple(term for term in self._engine.terms if term.weighted)
         self._engine.fill_parameters(self.scenes)
         register_user(self)
-        self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._scratch_terms = ti.ndarray(ti.f64, shape=self._engine.measures * self.batch)
         self._observed: dict[int, ti.Ndarray] = {}
         self._actions = ti.ndarray(ti.f64, shape=max(1, self.batch * self._engine.actions_per_step))
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         size = self.batch * self.manipulator_count * 3
         self._impulses = ti.ndarray(ti.f64, shape=max(1, size)) if impulses else None
-        self._particles = Particles(self._engine, self._numpy_real)
+        self._particles = Particles(self._engine)
         self._tape = Tape(self._particles)
         self._initial = self._particles.array(1)
         self._drive: LinkMotion | None = None
@@ -307,7 +306,7 @@ class Simulator:
         """
         self._require_runtime()
         self._require_fitting(scenes)
-        held = {e: self._checked_particles(x, f"particles[{e}]") for e, x in particles.items()}
+        held = {e: checked_positions(x, scenes[0], f"particles[{e}]") for e, x in particles.items()}
         before, poses, joints = initial_poses(self.scenes), self._initial_poses, self._initial_joints
         self.scenes = tuple(scenes)
         self.changes += 1
@@ -421,7 +420,7 @@ class Simulator:
                 lambda out: self._engine.export_mass(out.zero_()), math.prod(shape), double, like
             )
             return mass.reshape(shape)
-        out = np.zeros(math.prod(shape), self._numpy_real)
+        out = np.zeros(math.prod(shape), self.precision)
         self._engine.export_mass(out)
         return out.reshape(shape)
 
@@ -516,19 +515,16 @@ class Simulator:
             value = getattr(state, name)
             if np.shape(() if value is None else value) != shape:
                 raise ArgumentError(f"{name} has shape {np.shape(value)}, not {shape}")
-        self._checked_particles(state.x)
-        with np.errstate(over="ignore"):
-            packed = self._particles.pack(state)
-        if not np.isfinite(packed).all():
-            for name in ("v", "C", "F"):
-                require_finite(name, self._real(getattr(state, name)), "particle")
+        checked_positions(state.x, self.scenes[0])
+        for name in ("v", "C", "F"):
+            require_finite(name, self._real(getattr(state, name)), "particle")
         poses = np.array(state.poses, np.float64)
         require_finite("poses", poses, "manipulator")
         held = None if state.joints is None else np.array(state.joints, np.float64)
         if held is not None:
             require_finite("joints", held, "joint")
         self._version += 1
-        from_host(self._particles.current, packed)
+        from_host(self._particles.current, self._particles.pack(state))
         self._particles.reset_order()
         self._joints = held
         self._take_impulses(clear=True)
@@ -576,19 +572,15 @@ class Simulator:
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
         self._tape.forward(array, poses, None if gradient else terms, steps, plan)
-        bars = None
+        actions_bar, failures = None, dict[int, str]()
         if gradient:
             bars = self._tape.backward(array, poses, terms, steps, self.steps_before_contact(steps))
+            actions_bar = self._by_actions(bars, steps, actions, self._drive)
+            failures = broken_gradients(actions_bar)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), actions)
-        failures = broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
+        failures |= broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
             require_none(failures)
-        actions_bar = None
-        if bars is not None:
-            actions_bar = self._by_actions(bars, steps, actions, self._drive)
-            failures = broken_gradients(actions_bar) | failures
-            if strict:
-                require_none(failures)
         self._engine.place(poses, steps, self._pose, 0)
         judged = self._judged(values)
         step_terms, step_iou = judged.terms[1:].swapaxes(0, 1), judged.iou[1:].T
@@ -801,7 +793,7 @@ class Simulator:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
         given = map(sample_particles, scenes) if particles is None else particles
         names = [f"particles[{e}]" if self.batch > 1 else "particles" for e in range(self.batch)]
-        return [self._checked_particles(*pair) for pair in zip(given, names, strict=True)]
+        return [checked_positions(x, scenes[0], name) for x, name in zip(given, names, strict=True)]
 
     def _start_from(self, positions: Sequence[np.ndarray]) -> None:
         self._particles.start_order(positions)
@@ -822,13 +814,10 @@ class Simulator:
             self._map = JointActions(self.scenes, self.device)
         self._initial_joints = self._map.start if self._map else None
 
-    def _checked_particles(self, x: ArrayLike, label: str = "particles") -> np.ndarray:
-        return checked_positions(x, self.particle_count, self.grid_size, label)
-
     def _real(self, values: ArrayLike) -> np.ndarray:
         """Convert to the simulation's precision; numbers beyond its range become infinite."""
         with np.errstate(over="ignore"):
-            return np.asarray(values, self._numpy_real)
+            return np.asarray(values, self.precision)
 
     def _place(self, poses: np.ndarray) -> None:
         """Place the manipulators at the start of an episode and clear failures."""
