@@ -37,7 +37,7 @@ from plab.sim.state import (
     require_none,
 )
 from plab.sim.storage import WORLD
-from plab.sim.tape import RecordedStates, Tape, closed_loop, record
+from plab.sim.tape import RecordedStates, Tape, closed_loop
 from plab.sim.tensors import (
     copy_numbers,
     from_host,
@@ -274,11 +274,10 @@ class Simulator:
         """
         self._require_runtime()
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
-        for name, value in (("mass", mass), ("sdf", sdf)):
-            if np.shape(value) != expected:
-                raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
         held = {"mass": self._real(mass), "sdf": self._real(sdf)}
         for name, value in held.items():
+            if value.shape != expected:
+                raise ArgumentError(f"target {name} has shape {value.shape}, not {expected}")
             require_finite(f"target {name}", value, "node", axes=3)
         self.changes += 1
         # A copy, because the caller may modify and pass the same array again.
@@ -516,19 +515,16 @@ class Simulator:
             if np.shape(() if value is None else value) != shape:
                 raise ArgumentError(f"{name} has shape {np.shape(value)}, not {shape}")
         checked_positions(state.x, self.scenes[0])
-        for name in ("v", "C", "F"):
-            require_finite(name, self._real(getattr(state, name)), "particle")
-        poses = np.array(state.poses, np.float64)
-        require_finite("poses", poses, "manipulator")
-        held = None if state.joints is None else np.array(state.joints, np.float64)
-        if held is not None:
-            require_finite("joints", held, "joint")
+        entries = dict.fromkeys(("v", "C", "F"), "particle") | {"poses": "manipulator", "joints": "joint"}
+        for name, entry in entries.items():
+            if getattr(state, name) is not None:
+                require_finite(name, self._real(getattr(state, name)), entry)
         self._version += 1
         from_host(self._particles.current, self._particles.pack(state))
         self._particles.reset_order()
-        self._joints = held
+        self._joints = None if state.joints is None else np.array(state.joints, np.float64)
         self._take_impulses(clear=True)
-        self._place(poses)
+        self._place(state.poses)
 
     def initial_state(self) -> State:
         """Return the initial state of :meth:`reset` and :meth:`rollout`."""
@@ -574,7 +570,7 @@ class Simulator:
         self._tape.forward(array, poses, None if gradient else terms, steps, plan)
         actions_bar, failures = None, dict[int, str]()
         if gradient:
-            bars = self._tape.backward(array, poses, terms, steps, self.steps_before_contact(steps))
+            bars = self._tape.backward(terms, self.steps_before_contact(steps))
             actions_bar = self._by_actions(bars, steps, actions, self._drive)
             failures = broken_gradients(actions_bar)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), actions)
@@ -612,7 +608,7 @@ class Simulator:
             SimulationError: If the state stops being finite.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
-        return record(self, actions, every_step, mass, gradient)
+        return RecordedStates(self, actions, every_step, mass, gradient)
 
     def closed_loop(
         self,

@@ -148,6 +148,7 @@ class Tape:
             after: Called after each step with its number, and array and time slot of the resulting state.
         """
         particles = self._particles
+        self._actions, self._poses, self._steps = actions, poses, steps
         self._length = length or steps
         if length is not None:
             self._reach = min(length, self._reach_max)
@@ -160,7 +161,7 @@ class Tape:
             if k == last:
                 if begins:
                     self._engine.copy_slot(particles.current, 0, self._history[0], 0)
-                self._keep_step(t, actions, poses, known=False)
+                self._keep_step(t, known=False)
                 state, slot = self._place(t)
                 slot += self._engine.substeps
             else:
@@ -175,7 +176,7 @@ class Tape:
             history, slot = self._place(steps - 1)
             self._engine.copy_slot(history, slot + self._engine.substeps, particles.current, 0)
 
-    def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
+    def _keep_step(self, t: int, *, known: bool) -> None:
         """Run step t within the history; ``known`` is True if its particle order is known."""
         history, slot = self._place(t)
         number, step = divmod(t % self._length, self._reach)
@@ -185,7 +186,7 @@ class Tape:
         order = (history, slot - 1, self._moves) if self._engine.sorts and not known else None
         if self._engine.sorts and known:
             self._engine.move(history, slot - 1, history, slot, self._moves, t)
-        self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1), order)
+        self._particles.advance(history, slot, 1, self._poses, self._actions, t, (t, t + 1), order)
 
     def _entry(self, t: int) -> int:
         """First entry of the measures after step t."""
@@ -193,10 +194,7 @@ class Tape:
 
     def backward(
         self,
-        actions: ti.Ndarray,
-        poses: ti.Ndarray,
         terms: ti.Ndarray,
-        steps: int,
         contact_free: int,
         add: Callable[[int, ti.Ndarray, int, ti.Ndarray], None] | None = None,
         actions_bar: ti.Ndarray | None = None,
@@ -204,10 +202,7 @@ class Tape:
         """Backpropagate through the steps of :meth:`forward`.
 
         Args:
-            actions: Actions of :meth:`forward`.
-            poses: Pose history of :meth:`forward`.
             terms: Measures after each step are written to it, from the second entry.
-            steps: Environment steps T.
             contact_free: Number of initial steps without contact, in which particle adjoints are not needed.
             add: Called before each step with its number, array and time slot of the resulting state, and the
                 adjoint of this state, to which it may add.
@@ -217,7 +212,7 @@ class Tape:
         Returns:
             Adjoint of the actions, laid out like these.
         """
-        engine = self._engine
+        engine, actions, steps = self._engine, self._actions, self._steps
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape) if actions_bar is None else actions_bar
         # Allocated in the forward pass.
         assert self.bar is not None
@@ -228,14 +223,14 @@ class Tape:
             if k < last and (t + 1) % self._length == 0:
                 self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
                 for again in range(k * self._length, (k + 1) * self._length):
-                    self._keep_step(again, actions, poses, known=True)
+                    self._keep_step(again, known=True)
             history, slot = self._place(t)
             if add is not None:
                 add(t, history, slot + engine.substeps, self.bar)
             entry, contact = self._entry(t), int(t >= contact_free)
             stamp = self._particles.new_stamps(engine.substeps + 1)
             engine.step_adjoint(
-                history, self.bar, poses, actions, actions_bar, terms, entry, slot, t, stamp, contact
+                history, self.bar, self._poses, actions, actions_bar, terms, entry, slot, t, stamp, contact
             )
             if engine.sorts:
                 engine.move_back(self.bar, self._spare_bar, self._moves, t)
@@ -257,9 +252,41 @@ class RecordedStates:
         mass: Mass tensors, shape [batch, T, n, n, n]; None if not requested.
     """
 
-    def __init__(self, x: Any, v: Any, poses: Any, mass: Any, back: Callable[[dict[str, Any]], Any]) -> None:
-        """Store the states of :func:`record`; ``back`` runs the backward pass with derivatives by name."""
-        self.x, self.v, self.poses, self.mass, self._back = x, v, poses, mass, back
+    def __init__(
+        self, simulator: Simulator, actions: Any, every_step: bool, with_mass: bool, gradient: bool
+    ) -> None:
+        """Simulate and record; arguments and errors as in :meth:`plab.sim.Simulator.record`."""
+        engine, particles = simulator._engine, simulator._particles
+        array, steps, history, plan = simulator._started(actions, gradient)
+        self._simulator, self._like, self._gradient = simulator, actions, gradient
+        self._drive = simulator._drive
+        self._first = first = 0 if every_step else steps - 1
+        # Particle numbers of each state, if particles are sorted.
+        self._numbers: list[ti.Ndarray] = []
+        rows: list[Any] = []
+        masses: list[Any] = []
+
+        def note(t: int, state: ti.Ndarray, slot: int) -> None:
+            if t < first:
+                return
+            self._numbers.append(particles.noted_order())
+            rows.append(simulator._observe(state, slot, 1, actions))
+            if with_mass:
+                particles.losses(simulator._scratch_terms, 0, state, slot)
+                masses.append(simulator._mass(actions))
+
+        def stacked(parts: list[Any]) -> Any:
+            # A tensor implies that PyTorch is imported.
+            return sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
+
+        simulator._tape.forward(array, history, None, steps, plan, after=note)
+        require_none(broken_states(engine.read(engine.fault), engine.substeps))
+        engine.place(history, steps, simulator._pose, 0)
+        poses = numbers_of(history, (steps + 1, engine.batch, engine.manipulators, 8), actions)
+        moved = stacked(rows)
+        self.x, self.v, self.mass = moved[..., :3], moved[..., 3:], stacked(masses) if with_mass else None
+        self.poses = poses[1:].swapaxes(0, 1)[:, first:]
+        self._version = simulator._version
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:
         """Return the gradient of a function with respect to the actions, given its derivatives with respect
@@ -285,79 +312,43 @@ class RecordedStates:
                 gradient.
             SimulationError: If the gradient stops being finite.
         """
-        given = {"x": x, "v": v, "poses": poses, "mass": mass}
-        for name, bar in given.items():
-            shape = np.shape(getattr(self, name)) if getattr(self, name) is not None else None
-            if bar is not None and np.shape(bar) != shape:
+        by_step: dict[str, list[Any]] = {}
+        for name, bar in (("x", x), ("v", v), ("poses", poses), ("mass", mass)):
+            if bar is None:
+                continue
+            bar, shape = bar if on_device(bar) else np.asarray(bar), np.shape(getattr(self, name))
+            if np.shape(bar) != shape:
                 raise ArgumentError(
                     f"derivatives with respect to {name} have shape {np.shape(bar)}, not {shape}"
                 )
-        chosen = {name: bar for name, bar in given.items() if bar is not None}
-        return self._back({k: bar if on_device(bar) else np.asarray(bar) for k, bar in chosen.items()})
-
-
-def record(
-    simulator: Simulator, actions: Any, every_step: bool, with_mass: bool, gradient: bool
-) -> RecordedStates:
-    """Simulate and record; arguments, results and errors as in :meth:`plab.sim.Simulator.record`."""
-    engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
-    array, steps, poses, plan = simulator._started(actions, gradient)
-    drive, first = simulator._drive, 0 if every_step else steps - 1
-    # Particle numbers of each state, if particles are sorted.
-    numbers: list[ti.Ndarray] = []
-    rows: list[Any] = []
-    masses: list[Any] = []
-
-    def note(t: int, state: ti.Ndarray, slot: int) -> None:
-        if t < first:
-            return
-        numbers.append(particles.noted_order())
-        rows.append(simulator._observe(state, slot, 1, actions))
-        if with_mass:
-            particles.losses(simulator._scratch_terms, 0, state, slot)
-            masses.append(simulator._mass(actions))
-
-    def stacked(parts: list[Any]) -> Any:
-        # A tensor implies that PyTorch is imported.
-        return sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
-
-    tape.forward(array, poses, None, steps, plan, after=note)
-    require_none(broken_states(engine.read(engine.fault), engine.substeps))
-    engine.place(poses, steps, simulator._pose, 0)
-    shown = numbers_of(poses, (steps + 1, engine.batch, engine.manipulators, 8), actions)
-    version = simulator._version
-
-    def back(bars: dict[str, Any]) -> Any:
-        if not gradient or simulator._version != version:
+            by_step[name] = [_flat(part) for part in bar.swapaxes(0, 1)]
+        simulator, engine = self._simulator, self._simulator._engine
+        if not self._gradient or simulator._version != self._version:
             raise RuntimeError(
                 "there is no gradient: record with gradient=True, and pull back before the next simulation"
             )
-        by_step = {name: [_flat(bar[:, k]) for k in range(bar.shape[1])] for name, bar in bars.items()}
 
         def add(t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
             """Add the derivatives with respect to the state after step t to its adjoint."""
-            k = t - first
+            k = t - self._first
             if k < 0:
                 return
             for name, entry in (("x", 0), ("v", AT_V)):
                 if name in by_step:
-                    engine.add_cotangents(bar, numbers[k], by_step[name][k], entry)
+                    engine.add_cotangents(bar, self._numbers[k], by_step[name][k], entry)
             if "mass" in by_step:
                 engine.add_mass_cotangents(state, slot, bar, by_step["mass"][k])
             if "poses" in by_step and engine.manipulators:
                 engine.add_pose_cotangents(by_step["poses"][k])
 
+        steps = self._first + len(self._numbers)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
         with simulator._kept_weights():
             engine.write(engine.term_weights, np.zeros(engine.term_weights.shape))
-            before = simulator.steps_before_contact(steps)
-            by_motions = tape.backward(array, poses, terms, steps, before, add=add)
-        bar = simulator._by_actions(by_motions, steps, actions, drive)
-        require_none(broken_gradients(bar))
-        return bar
-
-    moved, mass = stacked(rows), stacked(masses) if with_mass else None
-    return RecordedStates(moved[..., :3], moved[..., 3:], shown[1:].swapaxes(0, 1)[:, first:], mass, back)
+            by_motions = simulator._tape.backward(terms, simulator.steps_before_contact(steps), add)
+        gradient = simulator._by_actions(by_motions, steps, self._like, self._drive)
+        require_none(broken_gradients(gradient))
+        return gradient
 
 
 def closed_loop(
@@ -439,9 +430,8 @@ def closed_loop(
     observe(0, particles.current, 0)
     tape.forward(actions, poses, None, steps, plan, after=lambda t, state, slot: observe(t + 1, state, slot))
     require_none(broken_states(engine.read(engine.fault), engine.substeps))
-    before = simulator.steps_before_contact(steps)
     with simulator._kept_weights() as weights:
-        tape.backward(actions, poses, terms, steps, before, add, actions_bar)
+        tape.backward(terms, simulator.steps_before_contact(steps), add, actions_bar)
     bars = numbers_of(actions_bar, (steps, engine.batch, engine.actions_per_step), like)
     require_none(broken_gradients(bars.swapaxes(0, 1)))
     react_at(0)
