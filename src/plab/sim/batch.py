@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
-from plab.scenes import MATERIAL_KEYS, Material, Scene, SceneError, find_law
+from plab.scenes import MATERIAL_KEYS, Scene, SceneError, find_law
 
 SHARED = (
     "particle_count",
@@ -148,11 +148,3 @@ def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tu
             bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **own}))
         changed.append(replace(scene, bodies=tuple(bodies)))
     return tuple(changed)
-
-
-def parameter_gradient(material: Material, bars: Sequence[float], keys: Sequence[str]) -> list[float]:
-    """Convert derivatives with respect to the coefficients of a material's law, shape [coefficient], to
-    derivatives with respect to parameters; 0 for parameters that the law does not have."""
-    law = material.kind
-    own = dict(zip(law.keys, law.parameter_gradient(material.values, bars[: law.size]), strict=True))
-    return [own.get(key, 0.0) for key in keys]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -17,7 +18,6 @@ from plab.sim.batch import (
     checked_positions,
     initial_poses,
     material_keys,
-    parameter_gradient,
     require_alike,
     require_finite,
     with_material,
@@ -363,7 +363,7 @@ class Simulator:
         """
         self._require_runtime()
         self._version += 1
-        through = (lambda given: self._follow(given, False).twists) if self._map else None
+        through = partial(self._follow, gradient=False) if self._map else None
         array = kernel_actions(actions, self._engine, self.action_dim, through)
         # Tensors in another stream than PyTorch's default are in a Taichi array already.
         if isinstance(array, np.ndarray):
@@ -680,15 +680,12 @@ class Simulator:
         materials, keys = self._engine.materials, self.material_keys
         bars = self._engine.material_bar.to_numpy()
         bars = bars.reshape(self.batch, -1, materials, bars.shape[1]).sum(axis=1)
-        gradient = np.array(
-            [
-                [
-                    parameter_gradient(m, bar, keys)
-                    for m, bar in zip(scene.materials[:materials], rows, strict=True)
-                ]
-                for scene, rows in zip(self.scenes, bars, strict=True)
-            ]
-        )
+        gradient = np.zeros((self.batch, materials, len(keys)))
+        for e, scene in enumerate(self.scenes):
+            for b, material in enumerate(scene.materials[:materials]):
+                law = material.kind
+                slopes = law.parameter_gradient(material.values, bars[e, b, : law.size])
+                gradient[e, b, [keys.index(key) for key in law.keys]] = slopes
         return gradient if materials > 1 else gradient[:, 0]
 
     def world_gradient(self) -> dict[str, np.ndarray]:
@@ -738,18 +735,19 @@ class Simulator:
     ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
         """Reset; return actions, number of steps, pose history, and steps per segment of a gradient."""
         self.reset()
-        through = (lambda given: self._follow(given, gradient).twists) if self._map else None
+        through = partial(self._follow, gradient=gradient) if self._map else None
         array = kernel_actions(actions, self._engine, self.action_dim, through, rollout=True)
         steps = np.shape(actions)[1]
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         return array, steps, self._pose_history(steps, self._initial_poses), plan
 
-    def _follow(self, actions: Any, gradient: bool = True) -> LinkMotion:
-        """Apply actions, shape [T, batch, A], to the joints of the articulated models."""
+    def _follow(self, actions: Any, gradient: bool = True) -> Any:
+        """Apply actions, shape [T, batch, A], to the joints of the articulated models; return the actions of
+        the manipulators."""
         assert self._map is not None
         self._drive = self._map.drive(self._joints, actions, gradient)
         self._joints = self._drive.joints
-        return self._drive
+        return self._drive.twists
 
     def _by_actions(
         self, bars: ti.Ndarray, steps: int, like: Any, drive: LinkMotion | None

@@ -371,12 +371,8 @@ def closed_loop(
     poses = simulator._pose_history(steps, np.asarray(simulator.poses()))
     # Particle order at each observation, and motions of articulated models in each step.
     numbers: list[ti.Ndarray] = []
-    drives: list[LinkMotion] = []
+    drives: list[LinkMotion | None] = []
     joints_bar: Any = None
-
-    def moved(chosen: Any) -> Any:
-        drives.append(simulator._follow(chosen))
-        return drives[-1].twists
 
     def observe(t: int, state: ti.Ndarray, slot: int) -> None:
         """Observe the state before step t, and choose the actions of that step."""
@@ -384,8 +380,9 @@ def closed_loop(
         posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
         chosen = choose(t, simulator._observe(state, slot, stride, like), posed)
         if t < steps:
-            through = moved if simulator._map else None
+            through = simulator._follow if simulator._map else None
             given = kernel_actions(chosen, engine, simulator.action_dim, through)
+            drives.append(simulator._drive)
             copy_numbers(actions, t * row, given, row, True)
 
     def react_at(t: int) -> tuple[Any, Any] | None:
@@ -395,9 +392,9 @@ def closed_loop(
         if t == steps:
             return react(t, None)
         bar = numbers_of(actions_bar, (engine.batch, engine.actions_per_step), like, first=t * row)
-        if drives:
+        if drive := drives[t]:
             # From the last to the first step, because later steps depend on the joints of earlier ones.
-            by_actions, joints_bar = drives[t].pull_back(bar[None], joints_bar)
+            by_actions, joints_bar = drive.pull_back(bar[None], joints_bar)
             bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
         return react(t, bar)
 
