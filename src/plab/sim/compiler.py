@@ -3,7 +3,7 @@
 Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025) and
 Quadrants 1.3.3; pyproject.toml lists the supported versions. Each function documents its changes and their
 reason. The standard library is changed only while Taichi is imported. :mod:`plab.sim` imports this module
-before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
+before any kernel is defined, as it changes Taichi's decorators.
 """
 
 from __future__ import annotations
@@ -163,27 +163,16 @@ def _launch_directly() -> None:
     ti.data_oriented = data_oriented
 
 
-if not QUADRANTS:
-    _skip_source_search()
-    _share_traces()
-    _omit_tracebacks()
-    _launch_directly()
-
-
 # -- compiling ----------------------------------------------------------------------------------------------
 
 
-def defer_position_lookup() -> None:
+def _defer_position_lookup() -> None:
     """Compute the position of an AST node only when an error is reported: patches
     ``ASTTransformerContext.get_pos_info``.
 
     Taichi wraps an excerpt of the source for each node, half of the compile time with a warm cache.
     """
-    if QUADRANTS:
-        return
     find = ASTTransformerContext.get_pos_info
-    if hasattr(find, "__wrapped__"):
-        return
 
     @functools.wraps(find)
     def position(context: Any, node: Any) -> str:
@@ -240,36 +229,37 @@ def clear_kernel_arguments() -> None:
         kernel.mapper.mapping.clear()
 
 
-def guard_array_release() -> None:
+def _guard_array_release() -> None:
     """Free arrays of vectors, too, but none created before a reinitialisation of Taichi: patches ``__init__``
-    and ``__del__`` of ``ScalarNdarray`` and ``VectorNdarray``.
+    of ``Ndarray``, and ``__del__`` of ``ScalarNdarray`` and ``VectorNdarray``.
 
     Taichi frees arrays of numbers only, and might free a new array at the same address.
     """
-    if QUADRANTS:
-        return
-    current, kinds = impl.get_runtime, (_ndarray.ScalarNdarray, matrix.VectorNdarray)
-    free = kinds[0].__del__
-    if hasattr(free, "__wrapped__"):
-        return
+    current, make, free = impl.get_runtime, _ndarray.Ndarray.__init__, _ndarray.ScalarNdarray.__del__
 
-    def patch(kind: Any, make: Callable[..., None]) -> None:
-        @functools.wraps(make)
-        def made(self: Any, *args: Any, **words: Any) -> None:
-            self.start = weakref.ref(current())
-            make(self, *args, **words)
+    @functools.wraps(make)
+    def made(self: Any) -> None:
+        self.start = weakref.ref(current())
+        make(self)
 
-        @functools.wraps(free)
-        def freed(self: Any) -> None:
-            # The program is missing during interpreter shutdown.
-            runtime = current()
-            if runtime is not None and self.start() is runtime:
-                free(self)
+    @functools.wraps(free)
+    def freed(self: Any) -> None:
+        # The program is missing during interpreter shutdown.
+        runtime = current()
+        if runtime is not None and self.start() is runtime:
+            free(self)
 
-        kind.__init__, kind.__del__ = made, freed
+    _ndarray.Ndarray.__init__ = made
+    _ndarray.ScalarNdarray.__del__ = matrix.VectorNdarray.__del__ = freed
 
-    for kind in kinds:
-        patch(kind, kind.__init__)
+
+if not QUADRANTS:
+    _skip_source_search()
+    _share_traces()
+    _omit_tracebacks()
+    _launch_directly()
+    _defer_position_lookup()
+    _guard_array_release()
 
 
 def place_fields() -> Any:

@@ -24,9 +24,7 @@ from plab.sim.compiler import (
     cache_lock,
     clear_kernel_arguments,
     cuda_available,
-    defer_position_lookup,
     free_fields,
-    guard_array_release,
     place_fields,
     ti,
 )
@@ -160,8 +158,6 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
             log_level=ti.ERROR,
         )
     clear_kernel_arguments()
-    guard_array_release()
-    defer_position_lookup()
     _current = asked
     return asked
 
