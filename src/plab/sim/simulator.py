@@ -36,10 +36,11 @@ from plab.sim.state import (
     broken_terms,
     require_none,
 )
-from plab.sim.storage import WORLD
-from plab.sim.tape import RecordedStates, Tape, closed_loop
+from plab.sim.storage import AT_V, WORLD
+from plab.sim.tape import RecordedStates, Tape
 from plab.sim.tensors import (
     copy_numbers,
+    flat,
     from_host,
     kernel_actions,
     numbers_of,
@@ -648,7 +649,79 @@ class Simulator:
         """
         if not self.terms:
             raise ArgumentError("there is no loss to differentiate: pass terms to Simulator")
-        return closed_loop(self, steps, choose, react, stride, discount, like)
+        poses = self._pose_history(steps, np.asarray(self.poses()))
+        engine, particles, tape = self._engine, self._particles, self._tape
+        row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
+        seen_shape = engine.batch, -(-engine.particles // stride), 6
+        actions = ti.ndarray(ti.f64, shape=max(1, steps * row))
+        actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+        # Particle order at each observation, and motions of articulated models in each step.
+        numbers: list[ti.Ndarray] = []
+        drives: list[LinkMotion | None] = []
+        joints_bar: Any = None
+
+        def observe(last: int, state: ti.Ndarray, slot: int) -> None:
+            """Observe the state after step ``last``, and choose the actions of the next one."""
+            t = last + 1
+            numbers.append(particles.noted_order())
+            posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
+            chosen = choose(t, self._observe(state, slot, stride, like), posed)
+            if t < steps:
+                through = self._follow if self._map else None
+                given = kernel_actions(chosen, engine, self.action_dim, through)
+                drives.append(self._drive)
+                copy_numbers(actions, t * row, given, row, True)
+
+        def react_at(t: int) -> tuple[Any, Any] | None:
+            """Return the derivatives with respect to the observation before step t, or the last observation,
+            given the adjoint of its actions."""
+            nonlocal joints_bar
+            if t == steps:
+                return react(t, None)
+            bar = numbers_of(actions_bar, (engine.batch, engine.actions_per_step), like, first=t * row)
+            if drive := drives[t]:
+                # From the last to the first step, because later steps depend on the joints of earlier ones.
+                by_actions, joints_bar = drive.pull_back(bar[None], joints_bar)
+                bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
+            return react(t, bar)
+
+        def add(t: int, _state: ti.Ndarray, _slot: int, bar: ti.Ndarray) -> None:
+            """Add the contribution of the observation after step t to the adjoint of its state."""
+            if discount != 1.0:
+                engine.write(engine.term_weights, weights * discount**t)
+            given = react_at(t + 1)
+            if given is None:
+                return
+            seen, posed = given
+            if (tuple(seen.shape), tuple(posed.shape)) != (seen_shape, posed_shape):
+                raise ArgumentError(
+                    f"derivatives with respect to the observation have shapes {tuple(seen.shape)} and "
+                    f"{tuple(posed.shape)}, not {seen_shape} and {posed_shape}"
+                )
+            for first in (0, AT_V):
+                shape = engine.batch, engine.particles, 3
+                whole = seen.new_zeros(shape) if on_device(seen) else np.zeros(shape, seen.dtype)
+                whole[:, ::stride] = seen[..., first : first + 3]
+                engine.add_cotangents(bar, numbers[t + 1], whole.reshape(-1), first)
+            if engine.manipulators:
+                engine.add_pose_cotangents(flat(posed))
+
+        self._version += 1
+        # Contact before these steps does not depend on their actions.
+        engine.write(engine.touched, np.zeros(engine.batch))
+        plan = tape.plan(steps, self.memory_mb)
+        terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
+        observe(-1, particles.current, 0)
+        tape.forward(actions, poses, None, steps, plan, after=observe)
+        require_none(broken_states(engine.read(engine.fault), engine.substeps))
+        with self._kept_weights() as weights:
+            tape.backward(terms, self.steps_before_contact(steps), add, actions_bar)
+        bars = numbers_of(actions_bar, (steps, engine.batch, engine.actions_per_step), like)
+        require_none(broken_gradients(bars.swapaxes(0, 1)))
+        react_at(0)
+        engine.place(poses, steps, self._pose, 0)
+        values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), like)
+        return self._judged(values).terms[1:].swapaxes(0, 1)
 
     def state_gradient(self) -> State:
         """Return the gradient of the last :meth:`rollout`'s loss with respect to its initial state.

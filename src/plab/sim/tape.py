@@ -1,4 +1,4 @@
-"""Rollouts and their backward pass: state checkpoints, recorded states and closed-loop control."""
+"""Rollouts and their backward pass: state checkpoints and recorded states."""
 
 from __future__ import annotations
 
@@ -15,12 +15,9 @@ from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
 from plab.sim.state import broken_gradients, broken_states, require_none
 from plab.sim.storage import AT_V
-from plab.sim.tensors import copy_numbers, kernel_actions, numbers_of, on_device
+from plab.sim.tensors import flat, numbers_of, on_device
 
 if TYPE_CHECKING:
-    import torch
-
-    from plab.kinematics.actions import LinkMotion
     from plab.sim.simulator import Simulator
 
 
@@ -238,7 +235,7 @@ class Tape:
         return actions_bar
 
 
-# -- callbacks between environment steps ------------------------------------------------------------------
+# -- recorded states ----------------------------------------------------------------------------------------
 
 
 class RecordedStates:
@@ -321,7 +318,7 @@ class RecordedStates:
                 raise ArgumentError(
                     f"derivatives with respect to {name} have shape {np.shape(bar)}, not {shape}"
                 )
-            by_step[name] = [_flat(part) for part in bar.swapaxes(0, 1)]
+            by_step[name] = [flat(part) for part in bar.swapaxes(0, 1)]
         simulator, engine = self._simulator, self._simulator._engine
         if not self._gradient or simulator._version != self._version:
             raise RuntimeError(
@@ -349,95 +346,3 @@ class RecordedStates:
         gradient = simulator._by_actions(by_motions, steps, self._like, self._drive)
         require_none(broken_gradients(gradient))
         return gradient
-
-
-def closed_loop(
-    simulator: Simulator,
-    steps: int,
-    choose: Callable[[int, Any, Any], Any],
-    react: Callable[[int, Any], tuple[Any, Any] | None],
-    stride: int,
-    discount: float,
-    like: torch.Tensor | None,
-) -> np.ndarray | torch.Tensor:
-    """Simulate and backpropagate; arguments, results and errors as in
-    :meth:`plab.sim.Simulator.closed_loop`."""
-    simulator._require_runtime()
-    engine, particles, tape = simulator._engine, simulator._particles, simulator._tape
-    row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
-    seen_shape = engine.batch, -(-engine.particles // stride), 6
-    actions = ti.ndarray(ti.f64, shape=max(1, steps * row))
-    actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
-    poses = simulator._pose_history(steps, np.asarray(simulator.poses()))
-    # Particle order at each observation, and motions of articulated models in each step.
-    numbers: list[ti.Ndarray] = []
-    drives: list[LinkMotion | None] = []
-    joints_bar: Any = None
-
-    def observe(t: int, state: ti.Ndarray, slot: int) -> None:
-        """Observe the state before step t, and choose the actions of that step."""
-        numbers.append(particles.noted_order())
-        posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
-        chosen = choose(t, simulator._observe(state, slot, stride, like), posed)
-        if t < steps:
-            through = simulator._follow if simulator._map else None
-            given = kernel_actions(chosen, engine, simulator.action_dim, through)
-            drives.append(simulator._drive)
-            copy_numbers(actions, t * row, given, row, True)
-
-    def react_at(t: int) -> tuple[Any, Any] | None:
-        """Return the derivatives with respect to the observation before step t, or the last observation,
-        given the adjoint of its actions."""
-        nonlocal joints_bar
-        if t == steps:
-            return react(t, None)
-        bar = numbers_of(actions_bar, (engine.batch, engine.actions_per_step), like, first=t * row)
-        if drive := drives[t]:
-            # From the last to the first step, because later steps depend on the joints of earlier ones.
-            by_actions, joints_bar = drive.pull_back(bar[None], joints_bar)
-            bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
-        return react(t, bar)
-
-    def add(t: int, _state: ti.Ndarray, _slot: int, bar: ti.Ndarray) -> None:
-        """Add the contribution of the observation after step t to the adjoint of its state."""
-        if discount != 1.0:
-            engine.write(engine.term_weights, weights * discount**t)
-        given = react_at(t + 1)
-        if given is None:
-            return
-        seen, posed = given
-        if (tuple(seen.shape), tuple(posed.shape)) != (seen_shape, posed_shape):
-            raise ArgumentError(
-                f"derivatives with respect to the observation have shapes {tuple(seen.shape)} and "
-                f"{tuple(posed.shape)}, not {seen_shape} and {posed_shape}"
-            )
-        for first in (0, AT_V):
-            shape = engine.batch, engine.particles, 3
-            whole = seen.new_zeros(shape) if on_device(seen) else np.zeros(shape, seen.dtype)
-            whole[:, ::stride] = seen[..., first : first + 3]
-            engine.add_cotangents(bar, numbers[t + 1], whole.reshape(-1), first)
-        if engine.manipulators:
-            engine.add_pose_cotangents(_flat(posed))
-
-    simulator._version += 1
-    # Contact before these steps does not depend on their actions.
-    engine.write(engine.touched, np.zeros(engine.batch))
-    plan = tape.plan(steps, simulator.memory_mb)
-    terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
-    observe(0, particles.current, 0)
-    tape.forward(actions, poses, None, steps, plan, after=lambda t, state, slot: observe(t + 1, state, slot))
-    require_none(broken_states(engine.read(engine.fault), engine.substeps))
-    with simulator._kept_weights() as weights:
-        tape.backward(terms, simulator.steps_before_contact(steps), add, actions_bar)
-    bars = numbers_of(actions_bar, (steps, engine.batch, engine.actions_per_step), like)
-    require_none(broken_gradients(bars.swapaxes(0, 1)))
-    react_at(0)
-    engine.place(poses, steps, simulator._pose, 0)
-    values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), like)
-    return simulator._judged(values).terms[1:].swapaxes(0, 1)
-
-
-def _flat(array: Any) -> Any:
-    if on_device(array):
-        return array.detach().reshape(-1).contiguous()
-    return np.ascontiguousarray(array).reshape(-1)

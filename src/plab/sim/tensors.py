@@ -85,6 +85,13 @@ def to_host(array: ti.Ndarray) -> np.ndarray:
     return out
 
 
+def flat(array: Any) -> Any:
+    """Return the numbers of an array, or of a CUDA tensor without its graph, as a contiguous vector."""
+    if on_device(array):
+        return array.detach().reshape(-1).contiguous()
+    return np.ascontiguousarray(array).reshape(-1)
+
+
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
     """Return a new tensor of ``count`` numbers with the device and type of a CUDA tensor, filled by the
     kernel that ``fill`` launches, in float64 if ``double``."""
