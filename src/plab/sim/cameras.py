@@ -68,13 +68,11 @@ class CameraSensor:
     def refresh(self) -> None:
         """Update after the simulator's scenes have changed."""
         scenes = self._simulator.scenes
-        spacings = [[(b.volume / b.particles) ** (1 / 3) for b in scene.bodies] for scene in scenes]
-        balls = [
-            BALL_RADIUS * np.array(own)[scene.particle_bodies]
-            for own, scene in zip(spacings, scenes, strict=True)
-        ]
-        labels = np.concatenate([FIRST_BODY + scene.particle_bodies for scene in scenes])
-        self._balls.from_numpy(np.concatenate(balls).astype(np.float32))
+        bodies = [scene.particle_bodies for scene in scenes]
+        spacings = [np.array([(b.volume / b.particles) ** (1 / 3) for b in scene.bodies]) for scene in scenes]
+        balls = BALL_RADIUS * np.concatenate([own[b] for own, b in zip(spacings, bodies, strict=True)])
+        labels = FIRST_BODY + np.concatenate(bodies)
+        self._balls.from_numpy(balls.astype(np.float32))
         self._labels.from_numpy(labels.astype(np.int32))
 
     def capture(
