@@ -28,14 +28,13 @@ from plab.objective import (
     target_sdf,
     total_loss,
 )
+from plab.plugins import torch
 from plab.scenes import SceneError
 from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, check_target, load_release_target
 
 if TYPE_CHECKING:
-    import torch
-
     from plab.scenes import Scene
 
 FIRST_SCENE = 1000
@@ -317,8 +316,6 @@ class Problem:
     def iou_gradient(self, actions: torch.Tensor) -> tuple[torch.Tensor, dict[int, str]]:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
         actions of that shape, and the diverged episodes with reasons; their gradient is 0."""
-        from plab.plugins import torch
-
         failures, given = dict[int, str](), actions.clone()
         target = torch.as_tensor(self.target_mass, dtype=torch.float64, device=actions.device)[:, None]
         b = target / target.amax((2, 3, 4), keepdim=True)

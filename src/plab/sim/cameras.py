@@ -6,18 +6,16 @@ the upper bits and label in the lower ones, so that an atomic minimum selects th
 order. Pictures are reproducible, independent of the batch.
 """
 
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plab.plugins import torch
 from plab.scenes import Camera
 from plab.sim.compiler import ti
 from plab.sim.tensors import Array, fill_tensor, on_device
 
 if TYPE_CHECKING:
-    import torch
-
     from plab.sim.simulator import Simulator
 
 BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
@@ -116,7 +114,7 @@ class CameraSensor:
         """Fill an image by a kernel; return an array, or a CUDA tensor like ``like``."""
         shape = self.batch, self.height, self.width
         if on_device(like):
-            dtype = getattr(sys.modules["torch"], kind.__name__)
+            dtype = getattr(torch, kind.__name__)
             picture: Any = like.new_empty(shape, dtype=dtype)
             fill_tensor(picture, lambda out: write(self._keys, *arguments, out.reshape(-1)))
         else:

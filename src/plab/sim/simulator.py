@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
+from plab.plugins import torch
 from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import (
     checked_positions,
@@ -50,8 +51,6 @@ from plab.sim.tensors import (
 )
 
 if TYPE_CHECKING:
-    import torch
-
     from plab.kinematics.actions import JointActions, LinkMotion
     from plab.losses.term import Term
 

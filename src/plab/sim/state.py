@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from plab.plugins import torch
 from plab.sim.runtime import SimulationError
 from plab.sim.tensors import on_device
-
-if TYPE_CHECKING:
-    import torch
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plab.errors import ArgumentError
+from plab.plugins import torch
 from plab.sim.compiler import ti
 from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
@@ -273,8 +273,7 @@ class RecordedStates:
                 masses.append(simulator._mass(actions))
 
         def stacked(parts: list[Any]) -> Any:
-            # A tensor implies that PyTorch is imported.
-            return sys.modules["torch"].stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
+            return torch.stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
 
         simulator._tape.forward(array, history, None, steps, plan, after=note)
         require_none(broken_states(engine.read(engine.fault), engine.substeps))

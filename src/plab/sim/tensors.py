@@ -4,7 +4,6 @@ Taichi and PyTorch share the CUDA context and the default stream, so kernels can
 directly.
 """
 
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
+from plab.plugins import torch
 from plab.sim.compiler import address_of, ti
 from plab.sim.runtime import copy_memory
 
 # Kernel arguments: Taichi or NumPy arrays or CUDA tensors, of numbers or of vectors.
 if TYPE_CHECKING:
-    import torch
     from typing_extensions import TypeIs
 
     Array = Any
@@ -95,7 +94,6 @@ def flat(array: Any) -> Any:
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
     """Return a new tensor of ``count`` numbers with the device and type of a CUDA tensor, filled by the
     kernel that ``fill`` launches, in float64 if ``double``."""
-    torch = sys.modules["torch"]
     out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
     if count:
         fill_tensor(out, fill)
@@ -108,7 +106,7 @@ def fill_tensor(out: "torch.Tensor", fill: Callable[[Any], None]) -> None:
         fill(out)
     else:
         # Pending work of the stream may read memory that the new tensor reuses.
-        sys.modules["torch"].cuda.current_stream().synchronize()
+        torch.cuda.current_stream().synchronize()
         fill(out)
         ti.sync()
 
@@ -164,7 +162,7 @@ def kernel_actions(
     array = ti.ndarray(ti.f64, shape=max(1, count))
     if elsewhere:
         # Wait for the actions of the manipulators.
-        sys.modules["torch"].cuda.current_stream().synchronize()
+        torch.cuda.current_stream().synchronize()
     if count:
         copy_numbers(array, 0, numbers, count, True)
     if elsewhere:
@@ -203,9 +201,5 @@ def _numbers(
 
 
 def _in_default_stream() -> bool:
-    """Return True if PyTorch uses the stream of Taichi's kernels, so that no synchronisation is needed.
-
-    A CUDA tensor implies that PyTorch is imported.
-    """
-    cuda = sys.modules["torch"].cuda
-    return bool(cuda.current_stream() == cuda.default_stream())
+    """Return True if PyTorch uses the stream of Taichi's kernels, so that no synchronisation is needed."""
+    return bool(torch.cuda.current_stream() == torch.cuda.default_stream())
