@@ -25,7 +25,7 @@ from toy_runner import COARSE_32
 
 HORIZON = 5
 ENVS = 3
-COARSE = ("task=Move", "observe_particles=5", "observe_target=true", *COARSE_32, f"sim.horizon={HORIZON}")
+COARSE = ("task=Move", "observe_particles=5", "observe_target=1", *COARSE_32, f"sim.horizon={HORIZON}")
 COARSE += (f"method.num_envs={ENVS}", "method.hidden=[8]", "progress=false")
 METHODS = {
     "shac": (

@@ -22,8 +22,8 @@ HORIZON = 3
 @pytest.fixture(scope="module")
 def episodes() -> EpisodeBatch:
     """Four environments, the second with a softer rope; the target is observed."""
-    first = load_config([*COARSE_ROPE, "observe_target=true"])
-    second = load_config([*COARSE_ROPE, "observe_target=true", "task.yield_stress=20"])
+    first = load_config([*COARSE_ROPE, "observe_target=1"])
+    second = load_config([*COARSE_ROPE, "observe_target=1", "task.yield_stress=20"])
     return EpisodeBatch([first, second, first, first], contact="soft")
 
 

@@ -17,7 +17,7 @@ from plab.runners.policy import load_policy, policy_path
 from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
 
-COARSE = ("observe_particles=5", "observe_target=true", *COARSE_32, "progress=false")
+COARSE = ("observe_particles=5", "observe_target=1", *COARSE_32, "progress=false")
 SEARCH = ("method=cem", "method.population=4", "method.elites=2", "method.iterations=2")
 
 
@@ -139,6 +139,6 @@ def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> N
     (tmp_path / "cameras.yaml").write_text("top: {place: 1}")
     assert "cameras.yaml" in told([*again, "--cameras", str(tmp_path / "cameras.yaml")], main)
     with pytest.raises(ConfigError, match="observe_target"):
-        run_config(cloned(written, "observe_target=false"), CACHE)
+        run_config(cloned(written, "observe_target=0"), CACHE)
     with pytest.raises(DatasetError, match="not a dataset"):
         metadata_of(tmp_path)

@@ -41,7 +41,7 @@ pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 
 @pytest.fixture(scope="module")
 def vector():
-    words = [*COARSE, NEAR, "observe_target=true"]
+    words = [*COARSE, NEAR, "observe_target=1"]
     env = plab.make_vec("Move", num_envs=2, overrides=words, randomize=RANGES, autoreset_mode="Disabled")
     yield env
     env.close()
@@ -57,7 +57,7 @@ def episode(env: gymnasium.Env, count: int, **how: object) -> list[object]:
 def test_a_row_of_a_batch_is_an_environment_alone(vector) -> None:
     bounds = ranges_of(vector.batch.configs[0].task)
     first, again = episode(vector, 2, seed=5), episode(vector, 2)
-    alone = plab.make("Move", overrides=[*COARSE, NEAR, "observe_target=true"], randomize=RANGES)
+    alone = plab.make("Move", overrides=[*COARSE, NEAR, "observe_target=1"], randomize=RANGES)
     for known in (first, again):
         how = {"seed": 6} if known is first else {}
         observation, info = alone.reset(**how)
@@ -124,7 +124,7 @@ def test_what_is_drawn_is_what_is_simulated(vector) -> None:
     options |= {"manipulators.left.offset": [-0.01, 0.0, 0.0], "manipulators.left.friction": 0.3}
     options["target.bodies.ball.center"] = [0.65, 0.47, 0.72]
     drawn = episode(vector, 2, options=options)
-    cfg = load_config(["task=Move", *COARSE, NEAR, "observe_target=true"])
+    cfg = load_config(["task=Move", *COARSE, NEAR, "observe_target=1"])
     task = replace(cfg.task, yield_stress=30.0, gravity=[0.0, -28.0, 0.0], floor_friction=0.5)
     ball, left = task.bodies["ball"], task.manipulators["left"]
     task.bodies["ball"] = replace(ball, center=[ball.center[0] + 0.01, *ball.center[1:]])
@@ -145,7 +145,7 @@ def test_what_is_drawn_is_what_is_simulated(vector) -> None:
 
 @pytest.mark.nightly
 def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() -> None:
-    cfg = load_config(["task=Rope", *COARSE, "observe_target=true"])
+    cfg = load_config(["task=Rope", *COARSE, "observe_target=1"])
     batch = EpisodeBatch([cfg] * 2, randomize={"scenes": 3})
     env, seen = TensorEnv(batch), set()
     for _ in range(4):
@@ -157,7 +157,7 @@ def test_scenes_of_the_random_variant_and_bodies_with_a_material_of_their_own() 
             drawn = load_config(["task=Rope", "variant=random", number, *COARSE])
             assert scene.manipulators[2].position == tuple(drawn.task.manipulators["pillar"].position)
             np.testing.assert_allclose(mass := batch.problem.target_mass[e], Problem([drawn]).target_mass[0])
-            aim = target_observation(batch.problem.initial_mass[e], mass)
+            aim = target_observation(batch.problem.initial_mass[e], mass, 1)
             assert np.array_equal(batch.randomizer.target_observations()[e], aim)
             assert np.array_equal(observed[e, -14:], aim.astype(np.float32))
     assert len(seen) > 1

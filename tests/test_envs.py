@@ -202,7 +202,7 @@ def test_a_reset_follows_changes_of_the_simulator(drawn: bool) -> None:
     keys = ["state", "mass", "target_mass", "target_points", "points", "impulses", "depth"]
     options = {"observe": keys, "randomize": ranges if drawn else {}}
     options |= {"render_mode": "rgb_array", "render_target": True, "render_size": (60, 40)}
-    words = [*OVERRIDES, "observe_target=true"]
+    words = [*OVERRIDES, "observe_target=1"]
     env, other = (plab.make_vec("Move", num_envs=2, overrides=words, **options) for _ in range(2))
     simulator, mask = env.batch.problem.simulator, {"reset_mask": np.array([True, False])}
 
@@ -248,7 +248,7 @@ def test_a_reset_follows_changes_of_the_simulator(drawn: bool) -> None:
 
 
 def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
-    words, actions = [*OVERRIDES, "observe_target=true", "observe_particles=7"], random_actions()
+    words, actions = [*OVERRIDES, "observe_target=1", "observe_particles=7"], random_actions()
 
     def made_of(*variants: str) -> list[Config]:
         each = [[f"variant={one}"] for one in variants]
@@ -267,7 +267,7 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
     stride = problem.scenes[0].particle_count // 7
     for k in range(2):
         particles = np.concatenate([state.x[k, ::stride], state.v[k, ::stride]], axis=1)
-        aim = target_observation(problem.initial_mass[k], problem.target_mass[k])
+        aim = target_observation(problem.initial_mass[k], problem.target_mass[k], 1)
         want = np.concatenate([particles.ravel(), state.poses[k, :, :7].ravel(), aim])
         assert np.array_equal(before[-3][k], want.astype(np.float32))
         assert batch.observation_space.contains(before[-3][k])

@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 from plab.config import build_scene, load_config
 from plab.objective import (
-    TARGET_ENTRIES,
     batch_scores,
     chamfer_distance,
     earth_movers_distance,
@@ -22,6 +21,7 @@ from plab.objective import (
     scores_from_iou,
     soft_iou,
     spread_mass,
+    target_entries,
     target_observation,
     target_sdf,
     total_loss,
@@ -81,13 +81,8 @@ def test_target_sdf_is_the_distance_to_the_nearest_target_node(rng):
 
 @given(tensors, tensors)
 def test_soft_iou_is_its_formula(a, b):
-    top_a, top_b = a.max(), b.max()
-    both = either = 0.0
-    for p, q in zip(a.ravel() / top_a, b.ravel() / top_b, strict=True):
-        both += p * q
-        either += p + q - p * q
-    iou = soft_iou(a, b)
-    assert iou == pytest.approx(both / either, rel=1e-9, abs=1e-12)
+    p, q, iou = a / a.max(), b / b.max(), soft_iou(a, b)
+    assert iou == pytest.approx((p * q).sum() / (p + q - p * q).sum(), rel=1e-9, abs=1e-12)
     assert 0 <= iou <= 1 + 1e-12
     assert soft_iou(b, a) == pytest.approx(iou, rel=1e-12)
     assert soft_iou(3 * a, 0.5 * b) == pytest.approx(iou, rel=1e-9)
@@ -121,8 +116,8 @@ def box_of_mass(low, high, n=32):
 def test_target_observation():
     """Disjoint boxes require moving all mass; for half a box, half of the mass may stay."""
     start, target = box_of_mass((4, 6, 8), (8, 12, 16)), 3.0 * box_of_mass((20, 8, 18), (26, 12, 22))
-    seen = target_observation(start, target)
-    assert seen.shape == (TARGET_ENTRIES,)
+    seen = target_observation(start, target, 1)
+    assert seen.shape == (target_entries(1),)
     corners = zip(seen.reshape(2, 7), ((4, 6, 8), (20, 8, 18)), ((8, 12, 16), (26, 12, 22)), strict=True)
     for (share, *numbers), low, high in corners:
         width = np.subtract(high, low)
@@ -131,12 +126,17 @@ def test_target_observation():
         # Of uniform nodes, and of the Gaussian, cut off at four deviations.
         np.testing.assert_allclose(numbers[3:], np.sqrt((width**2 - 1) / 12 + 1.0) / 32, rtol=1e-3)
     start, target = box_of_mass((8, 8, 8), (16, 16, 16)), box_of_mass((12, 8, 8), (20, 16, 16))
-    go, come = target_observation(start, target).reshape(2, 7)
+    go, come = target_observation(start, target, 1).reshape(2, 7)
     assert go[0] == come[0] == pytest.approx(0.5, abs=0.01)
     np.testing.assert_allclose((go[1] * 32, come[1] * 32), (9.5, 17.5), atol=0.3)
     np.testing.assert_allclose((go[2:4], come[2:4]), 11.5 / 32, atol=1e-9)
     assert mass_change(start, target)[17, 11, 11] > 0 > mass_change(start, target)[9, 11, 11]
-    assert not target_observation(start, start).any()
+    assert not target_observation(start, start, 2).any()
+    # Four parts of equal mass, dividing the plane x = 15.
+    start, target = box_of_mass((0, 0, 0), (4, 4, 4)), box_of_mass((13, 8, 16), (18, 12, 24))
+    parts = target_observation(start, target, 2)[target_entries(2) // 2 + 1 :]
+    x, _, z = parts.reshape(4, 6).T[:3] * 32
+    np.testing.assert_allclose((x, z), ([13.75] * 2 + [16.25] * 2, [17.5, 21.5] * 2), atol=0.2)
 
 
 def test_total_loss(rng):

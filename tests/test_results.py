@@ -86,7 +86,7 @@ def test_hash_and_path_depend_on_what_can_change_a_result(tmp_path: Path) -> Non
         {"seed": 4},
         {"seed_particles": 3},
         {"observe_particles": 5},
-        {"observe_target": True},
+        {"observe_target": 1},
         {"method": method | {"lr": 0.01}},
         {"sim": sim | {"precision": "float64"}},
         {"sim": sim | {"device": "cuda"}},

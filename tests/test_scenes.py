@@ -58,6 +58,6 @@ def test_unfinished_shapes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_entries_along_x_and_z_are_two_apart():
-    cfg = load_config(["task=Move", "observe_target=true"])
+    cfg = load_config(["task=Move", "observe_target=1"])
     along_x, along_z = level_entries(build_scene(cfg), cfg)
     np.testing.assert_array_equal(along_z - along_x, 2)

@@ -6,7 +6,8 @@ with gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +16,6 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError, ConfigError, suggest
 from plab.plugins import scipy
-
-TARGET_ENTRIES = 14
-"""Length of :func:`target_observation`."""
 
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian smoothing in :func:`mass_change` [domain units]."""
@@ -256,24 +254,43 @@ def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
     return scipy.ndimage.gaussian_filter(change, SMOOTHING * len(target), mode="constant")
 
 
-def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
+def target_entries(slices: int) -> int:
+    """Return the length of :func:`target_observation`; 0 without slices."""
+    return 2 * (1 + 6 * slices**2) if slices else 0
+
+
+def target_observation(start: np.ndarray, target: np.ndarray, slices: int) -> np.ndarray:
     """Describe a target by excess and missing mass, given the mass tensors of the initial state and the
     target, shape [n, n, n].
 
+    Each of both is divided into ``slices`` parts of equal mass along x, and each of these along z.
+
     Returns:
-        Fraction of the total mass, centroid (3) and standard deviation along each axis (3) [domain units], of
-        the excess mass, then of the missing mass; shape [14], float64.
+        Fraction of the total mass, then centroid (3) and standard deviation along each axis (3) [domain
+        units] of each part, of the excess mass, then of the missing mass; shape [2 (1 + 6 slices²)], float64.
     """
     change = mass_change(start, target)
-    node = np.indices(change.shape).reshape(3, -1) / len(change)
+    node = np.arange(len(change)) / len(change)
     numbers: list[float] = []
-    for part in (-change, change):
-        mass = part.clip(0.0).reshape(-1)
-        share = mass / max(mass.sum(), TINY)
-        centroid = node @ share
-        spread = np.sqrt(((node - centroid[:, None]) ** 2) @ share)
-        numbers += [mass.sum(), *centroid, *spread]
+    for mass in ((-change).clip(0.0), change.clip(0.0)):
+        numbers.append(mass.sum())
+        for part in (part for slab in _slices(mass, 0, slices) for part in _slices(slab, 2, slices)):
+            along = np.array([part.sum(other) for other in ((1, 2), (0, 2), (0, 1))])
+            along /= max(part.sum(), TINY)
+            centroid = along @ node
+            spread = np.sqrt((along * (node - centroid[:, None]) ** 2).sum(1))
+            numbers += [*centroid, *spread]
     return np.array(numbers)
+
+
+def _slices(mass: np.ndarray, axis: int, count: int) -> Iterator[np.ndarray]:
+    """Yield parts of equal mass along an axis, each of the shape of ``mass``, which may divide planes."""
+    plane = mass.sum(tuple({0, 1, 2} - {axis}), keepdims=True)
+    end = plane.cumsum(axis)
+    edges = np.linspace(0.0, end.max(), count + 1)
+    for low, high in itertools.pairwise(edges):
+        inside = (np.minimum(end, high) - np.maximum(end - plane, low)).clip(0.0)
+        yield mass * (inside / np.maximum(plane, TINY))
 
 
 def total_loss(terms: Any, weights: Any) -> Any:

@@ -29,11 +29,13 @@ FIRST = 10_000
 
 
 def scores_of(policy: Policy, cfgs: Sequence[Config], batch: EpisodeBatch) -> np.ndarray:
-    """Return a policy's scores in the hard contact model, shape [configuration]; 0 after divergence."""
+    """Return a policy's scores in the hard contact model, shape [configuration]; 0 after divergence.
+    ``batch`` has the first configurations."""
     found: list[float] = []
     for first in range(0, len(cfgs), batch.size):
         own = cfgs[first : first + batch.size]
-        batch.renew([own[k % len(own)] for k in range(batch.size)])
+        if first:
+            batch.renew([own[k % len(own)] for k in range(batch.size)])
         observation, info = batch.reset()
         for _ in range(batch.horizon):
             step = batch.step(policy(observation), strict=False)
@@ -102,7 +104,7 @@ def main(argv: Sequence[str]) -> None:
 
     EXAMPLES
       plab bench unseen results/Move-vrandom9000/pods/seed0-12ab34cd.h5 --csv unseen.csv
-      plab bench unseen --policy mine:act task=Torus observe_target=true sim.device=cuda
+      plab bench unseen --policy mine:act task=Torus observe_target=1 sim.device=cuda
     """
     parser = Parser("plab bench unseen", main.__doc__)
     parser.add_argument("what", nargs="+", metavar="RESULT | KEY=VALUE", help="keys are those of plab run")

@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> None:
 
     EXAMPLES
       plab dataset task=Move
-      plab dataset task=Torus variant=random 'seed_scene=range(1000,1050)' observe_target=true
+      plab dataset task=Torus variant=random 'seed_scene=range(1000,1050)' observe_target=1
       plab dataset task=Move variant=random 'seed_scene=range(1000,1050)' method=adam sim.device=cuda
       plab dataset example method=solve --observe state,depth
     """
@@ -198,11 +198,13 @@ def _spaces(
 
 
 def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> Iterator[Episode]:
-    """Replay demonstrations of one task, and yield the episodes that do not diverge."""
+    """Replay demonstrations of one task, in a batch of the first ones, and yield the episodes that do not
+    diverge."""
     for first in range(0, len(demonstrations), batch.size):
         part = demonstrations[first : first + batch.size]
         filled = [part[k % len(part)] for k in range(batch.size)]
-        batch.renew([one.cfg for one in filled])
+        if first:
+            batch.renew([one.cfg for one in filled])
         observation, info = batch.reset()
         actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
         if (length := actions.shape[1]) != batch.horizon:

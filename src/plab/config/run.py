@@ -138,8 +138,8 @@ class Config(ranges.Section):
         seed_particles: Seed of the particles' initial positions. Simulated targets use 0.
         observe_particles: Minimum number of particles in an observation, which contains every
             (particle count // this)-th.
-        observe_target: Whether observations include :func:`plab.objective.target_observation`, for policies
-            that are trained on several targets.
+        observe_target: Slices of :func:`plab.objective.target_observation` in observations, for policies that
+            are trained on several targets; 0: none.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Whether to recompute an existing result.
@@ -157,7 +157,7 @@ class Config(ranges.Section):
     seed_scene: int | None = field(metadata=ranges.NOT_NEGATIVE)
     seed_particles: int = field(metadata=ranges.SEED)
     observe_particles: int = field(metadata=ranges.COUNT)
-    observe_target: bool
+    observe_target: int = field(metadata=ranges.NOT_NEGATIVE)
     seed: int = field(metadata=ranges.SEED)
     results_dir: str
     force: bool

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from plab.config import Config
+from plab.plugins import scipy
 from plab.scenes import Scene
 from plab.targets.scripted import ActionTrack
 
@@ -32,7 +35,7 @@ def carry(cfg: Config, scene: Scene) -> np.ndarray | None:
     if list(goals) != list(cfg.task.bodies) or scene.kinematics or not (tools and movable):
         return None
     centres = np.array([body.center for body in scene.bodies])
-    ways = np.array([goal["center"] for goal in goals.values()]) - centres
+    ways = _ways(scene, np.array([goal["center"] for goal in goals.values()]))
     tracks, held = list[ActionTrack](), list[int]()
     for tool in tools:
         offsets = centres - np.asarray(tool.position)
@@ -48,3 +51,13 @@ def carry(cfg: Config, scene: Scene) -> np.ndarray | None:
         track.wait(together)
         track.go(ways[body])
     return np.concatenate([track.first(scene.horizon) for track in tracks], axis=1)
+
+
+def _ways(scene: Scene, goals: np.ndarray) -> np.ndarray:
+    """Return the displacements of bodies to their places, shape [body, 3]; equal bodies exchange places if
+    this shortens the ways."""
+    bodies = scene.bodies
+    ways = goals - np.array([body.center for body in bodies])[:, None]
+    alike = [[replace(a, center=b.center) == b for b in bodies] for a in bodies]
+    rows, places = scipy.optimize.linear_sum_assignment(np.where(alike, (ways**2).sum(2), 1e6))
+    return ways[rows, places]

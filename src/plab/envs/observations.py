@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict, Space
 
 from plab.config import Config, ranges
 from plab.errors import ArgumentError
-from plab.objective import TARGET_ENTRIES, target_observation
+from plab.objective import target_entries, target_observation
 from plab.problem import Problem
 from plab.scenes import Camera, Scene, named_cameras
 from plab.sim import Simulator
@@ -47,11 +47,9 @@ class Observer:
         self.stride = _stride(scene, cfg.observe_particles)
         self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
         self._numbers = len(scene.manipulators) * 8
-        size = len(problem.scenes)
-        self.constant = TARGET_ENTRIES if cfg.observe_target else 0
-        self._target = Constants(
-            _target_observations(problem, known()) if cfg.observe_target else np.empty((size, 0))
-        )
+        self.constant, slices = target_entries(cfg.observe_target), cfg.observe_target
+        nothing = np.empty((len(problem.scenes), 0))
+        self._target = Constants(_target_observations(problem, known(), slices) if slices else nothing)
 
     def __call__(self, particles: Array, poses: Array) -> Array:
         """Return observations, shape [batch, entry], given particles, shape [batch, observed, 6], and all
@@ -321,8 +319,9 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
     """Return the indices of the entries that are positions along x and along z, shape [2, position]: those of
     observed particles, manipulators and, if observed, the target."""
     particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
-    # Excess mass, then missing mass: fraction, centroid (3) and standard deviations (3) of each.
-    centroids = [1, 8] if cfg.observe_target else []
+    # Excess mass, then missing mass: fraction, then centroid (3) and standard deviations (3) of each part.
+    entries = target_entries(cfg.observe_target)
+    centroids = [entry for first in (0, entries // 2) for entry in range(first + 1, first + entries // 2, 6)]
     along_x = [
         *range(0, particles, 6),
         *(particles + np.flatnonzero(poses % 8 == 0)),
@@ -346,13 +345,14 @@ def _count(scene: Scene, least: int) -> int:
     return len(range(0, scene.particle_count, _stride(scene, least)))
 
 
-def _target_observations(problem: Problem, known: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return the target observation of each environment, shape [batch, 14], given some of them."""
+def _target_observations(problem: Problem, known: Mapping[int, np.ndarray], slices: int) -> np.ndarray:
+    """Return the target observation of each environment, shape [batch, entry], given some of them."""
     others = [e for e in range(len(problem.scenes)) if e not in known]
     pairs = [(problem.initial_mass[e], problem.target_mass[e]) for e in others]
     # Targets may repeat within a batch.
     keys = [b"".join(mass.tobytes() for mass in masses) for masses in pairs]
-    found = {key: target_observation(*masses) for key, masses in dict(zip(keys, pairs, strict=True)).items()}
+    unique = dict(zip(keys, pairs, strict=True))
+    found = {key: target_observation(*masses, slices) for key, masses in unique.items()}
     every = {**known, **{e: found[key] for e, key in zip(others, keys, strict=True)}}
     return np.array([every[e] for e in range(len(every))])
 
@@ -366,7 +366,7 @@ def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
     # Shares, centroids and deviations are within the unit cube.
-    seen = TARGET_ENTRIES if cfg.observe_target else 0
+    seen = target_entries(cfg.observe_target)
     least = np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)])
     most = np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)])
     observation = Box(least.astype(np.float32), most.astype(np.float32), dtype=np.float32)

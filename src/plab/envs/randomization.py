@@ -66,12 +66,12 @@ class _Base:
 
     @functools.cached_property
     def target_observation(self) -> np.ndarray:
-        """Observation of the target in the initial state, shape [14]."""
+        """Observation of the target in the initial state, shape [entry]."""
         scene = self.scene
         # Rounded as in the simulator, so that the result is the same as from its initial state.
         x = self.particles.astype(self.cfg.sim.precision).astype(np.float64)
         mass = spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor_stencil)
-        return target_observation(mass, self.targets[-1][0])
+        return target_observation(mass, self.targets[-1][0], self.cfg.observe_target)
 
 
 class EpisodeRandomizer:

@@ -168,8 +168,8 @@ class Chain:
             together: Patterns of joints that share one action component, by the component's name.
 
         Raises:
-            ModelError: If a pattern matches no joint, an initial position is outside its limits, or no joint
-                can move.
+            ModelError: If a pattern matches no joint, limits are not in order, an initial position is outside
+                them, or no joint can move.
         """
         turn = pose_matrix((0.0, 0.0, 0.0), rotation)
         place = pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
@@ -193,6 +193,8 @@ class Chain:
         shared = {name: word for word in together for name in matched("together", {together[word]: 1}, names)}
         for k, joint in enumerate(joints):
             low, high = bounds.get(joint.name, (joint.low, joint.high))
+            if low > high:
+                raise ModelError(f"limits: joint {joint.name} has {low:g} .. {high:g}, not lowest, highest")
             at = starts.get(joint.name, float(np.clip(0.0, low, high)))
             if not low <= at <= high:
                 raise ModelError(

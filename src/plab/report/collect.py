@@ -83,8 +83,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
 
     Args:
         source: Folder of results, archive, or several of them.
-        chosen: Selection of runs; defaults: the suite's tasks and variants, the methods and seeds of the
-            paper and of the results.
+        chosen: Selection of runs; defaults: the suite's tasks, or those of the results if it has none of
+            them; the suite's variants; the methods and seeds of the paper and of the results.
         split: Setting whose values are treated as separate methods: a dotted key, ``folder`` or ``seed``;
             empty: none.
 
@@ -97,8 +97,9 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     found, unreadable = rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
+    suite, own = suite_tasks(), sorted({row.values["task"] for row in fitting})
     free = {
-        "task": suite_tasks(),
+        "task": suite if not own or set(own) & set(suite) else own,
         "variant": list(SUITE_VARIANTS),
         "method": ordered(row.values["method"] for row in fitting),
         "seed": sorted({str(row.values["seed"]) for row in fitting} | set(PAPER_SEEDS), key=int),

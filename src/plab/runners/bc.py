@@ -2,8 +2,8 @@
 
 Datasets are written by ``plab dataset`` or Minari. To reproduce a result:
 
-    plab dataset task=Torus variant=random 'seed_scene=range(1000,1400)' observe_target=true
-    plab run task=Torus variant=random seed_scene=9000 method=bc observe_target=true
+    plab dataset task=Torus variant=random 'seed_scene=range(1000,1400)' observe_target=1
+    plab run task=Torus variant=random seed_scene=9000 method=bc observe_target=1
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ action sequences, which is much easier than improving a network. The sequences o
 similar, because all of them start from the policy. If there are more scenes than environments, rounds
 alternate between them, and the policy imitates the latest actions of each scene. To reproduce a result:
 
-    python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true observe_particles=10 \
+    python -m plab.run task=Move variant=random seed_scene=9000 observe_target=1 observe_particles=10 \
         method=pods method.scenes=1280 method.shift=0.2 method.episodes=15360 seed=0 sim.device=cuda
 """
 
