@@ -101,8 +101,7 @@ def test_scores_are_their_formulas(rng):
     assert s.score == pytest.approx(min(max((end - start) / (best - start), 0), 1))
     assert 0 < s.score_printed < s.score
     # Worse than the start: clamped, while the printed formula goes below 0.
-    worse = np.zeros((4, 4, 4))
-    worse[np.unravel_index(target.argmin(), target.shape)] = 1.0
+    worse = np.where(target == target.min(), 1.0, 0.0)
     s = scores(initial, worse, target)
     assert s.score == 0.0 > s.score_printed and scores(initial, target, target).score == 1.0
 
