@@ -171,23 +171,24 @@ class Problem:
         require_alike(cfgs)
         # Vectorised environments and seeds of a sweep often have equal scenes, which are built once.
         kinds = kinds_of(cfgs)
+        first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or make_simulator(cfgs)
         self.scenes = self.simulator.scenes
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
-        masses = make_targets(cfgs, self.simulator)
+        self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
         # Distances are computed once for equal targets.
-        unique = dict(zip(kinds, masses, strict=True))
-        distances = {kind: target_distance(mass) for kind, mass in unique.items()}
+        distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
         self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
-        self.simulator.set_target(masses, np.stack(self._distances))
+        self.simulator.set_target(self.target_mass, np.stack(self._distances))
         self.target_mass = self.simulator.target_mass
         self.simulator.set_weights({name: weights[name] for name in self.term_names})
         # Generating a target changes the contact model, loading it from the cache does not.
         self.simulator.set_contact("soft")
         self._held_weights = Constants(self.weights)
+        self._relative_target: tuple[np.ndarray, Constants] | None = None
         self.refresh(kinds)
         blind = {
             f"{cfg.task.name}-v{cfg.variant}: the score is only 0 or 1, because the start's soft IoU with "
@@ -317,14 +318,12 @@ class Problem:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for
         actions of that shape, and the diverged episodes with reasons; their gradient is 0."""
         failures, given = dict[int, str](), actions.clone()
-        target = torch.as_tensor(self.target_mass, dtype=torch.float64, device=actions.device)[:, None]
-        b = target / target.amax((2, 3, 4), keepdim=True)
         while True:
             given[list(failures)] = 0.0
             try:
                 recorded = self.simulator.record(given if given.is_cuda else given.numpy(), every_step=False)
                 mass = torch.as_tensor(recorded.mass).double().requires_grad_()
-                a = mass / mass.amax((2, 3, 4), keepdim=True)
+                a, b = mass / mass.amax((2, 3, 4), keepdim=True), self._target_like(mass)
                 both = (a * b).sum((2, 3, 4))
                 iou = both / ((a + b).sum((2, 3, 4)) - both)
                 (slope,) = torch.autograd.grad(iou.sum(), mass)
@@ -337,6 +336,18 @@ class Problem:
                 continue
             out[list(failures)] = 0.0
             return out, failures
+
+    def _target_like(self, mass: torch.Tensor) -> torch.Tensor:
+        """Return the targets' masses relative to the largest of each, shape [batch, 1, n, n, n], on the
+        device of a tensor, to which they are copied once."""
+        from plab.plugins import torch
+
+        known = self._relative_target
+        if known is None or known[0] is not self.target_mass:
+            target = np.asarray(self.target_mass, np.float64)[:, None]
+            known = self.target_mass, Constants(target / target.max((2, 3, 4), keepdims=True))
+            self._relative_target = known
+        return torch.as_tensor(known[1].like(mass))
 
     def rollout(
         self, actions: np.ndarray | torch.Tensor, *, gradient: bool, strict: bool = True, exact: bool = True
@@ -406,7 +417,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
     :func:`plab.targets.build_targets`.
 
     Args:
-        cfgs: One configuration per environment.
+        cfgs: One configuration per environment; equal ones share one object.
         simulator: Simulator of their scenes.
         rebuild: Whether to simulate cached targets again.
     """

@@ -110,9 +110,9 @@ def build_targets(
     own = simulator.scenes
     scenes = [_target_scene(scene, make_recipe(target)) for scene, target in zip(own, targets, strict=True)]
     # Vectorised environments are often equal, so each kind is built once.
-    kinds = [(scene, str(target)) for scene, target in zip(scenes, targets, strict=True)]
-    masses: dict[tuple[Scene, str], np.ndarray] = {}
-    missing: dict[tuple[Scene, str], np.ndarray] = {}
+    kinds = [(scene, id(target)) for scene, target in zip(scenes, targets, strict=True)]
+    masses: dict[tuple[Scene, int], np.ndarray] = {}
+    missing: dict[tuple[Scene, int], np.ndarray] = {}
     for kind, target in dict(zip(kinds, targets, strict=True)).items():
         if (script := demonstration(kind[0], target)) is None:
             masses[kind] = build_target(kind[0], target)
