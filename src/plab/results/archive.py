@@ -23,6 +23,9 @@ from plab.config.selection import Selection, require_possible
 from plab.results.run_file import ARCHIVE_SUFFIX, ResultsError, RunResult, encode, read, replace_file
 from plab.results.run_table import Row, rows
 
+_FILTER = {"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 4, "pb": 3}
+"""Compression of an archive, of numbers of eight bytes: 2.5 % smaller than with preset 9 alone."""
+
 
 def pack(
     source: str | Path | Sequence[str | Path],
@@ -73,7 +76,7 @@ def pack(
         # Paths are meaningless on other computers.
         run = replace(run, config=run.config | {"results_dir": "results"}, masses={})
         members.append((name, encode(run if digits is None else _rounded(run, digits), compress=False)))
-    replace_file(archive, lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9), sync=True)
+    replace_file(archive, lzma.compress(zipped(members, zipfile.ZIP_STORED), filters=[_FILTER]), sync=True)
     return len(members), unreadable
 
 
