@@ -91,16 +91,16 @@ tex-packages:
 	apt-get install -y --no-install-recommends texlive-latex-base texlive-latex-recommended
 
 tables: $(VENV)/.run.stamp
-	$(BIN)/python -m plab.report tables $(RESULTS) --out $(REPORTS)/tables
+	$(BIN)/python -m plab.report tables $(RESULTS) --output $(REPORTS)/tables
 
 curves: $(VENV)/.run.stamp
-	$(BIN)/python -m plab.report curves $(RESULTS) --out $(REPORTS)/curves
+	$(BIN)/python -m plab.report curves $(RESULTS) --output $(REPORTS)/curves
 
 report: $(VENV)/.report.stamp
-	$(BIN)/python -m plab.report notebooks $(RESULTS) --out $(REPORTS)/notebooks
+	$(BIN)/python -m plab.report notebooks $(RESULTS) --output $(REPORTS)/notebooks
 
 html: $(VENV)/.report.stamp
-	$(BIN)/python -m plab.report html $(RESULTS) --out $(REPORTS)/html
+	$(BIN)/python -m plab.report html $(RESULTS) --output $(REPORTS)/html
 
 clean:
 	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov

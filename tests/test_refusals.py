@@ -167,7 +167,7 @@ def test_refusals_of_the_other_command_lines(refused, entry, argv, named):
 IN_THE_WAY = [
     (main, "results_dir=blocked/results"),
     (results.main, f"pack results --output blocked/{ARCHIVE}"),
-    (report.main, "tables results --out blocked/tables"),
+    (report.main, "tables results --output blocked/tables"),
     (render, "task=Rope --output blocked/a.png"),
     (view, "task=Rope --output blocked/a.html"),
     (export, "task=Rope --output blocked"),

@@ -153,7 +153,7 @@ def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path,
         config["task"]["yield_stress"] = stress
         synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS))
     words = ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac", "--split", "task.yield_stress"]
-    assert main(["curves", *words, str(folder), str(more), "--out", str(out)]) == 0
+    assert main(["curves", *words, str(folder), str(more), "--output", str(out)]) == 0
     assert "6 figures" in capsys.readouterr().out
     assert [len(list(out.glob(f"*.{form}"))) for form in ("pdf", "png")] == [6, 6]
     for path in out.glob("*.pdf"):

@@ -109,7 +109,7 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
 
 
 def test_a_folder_without_runs_is_named(tmp_path: Path, told) -> None:
-    words = [str(tmp_path), "--out", str(tmp_path / "out")]
+    words = [str(tmp_path), "--output", str(tmp_path / "out")]
     for form in ("notebooks", "html"):
         assert str(tmp_path) in told([form, *words], main)
 
@@ -119,7 +119,7 @@ def test_notebooks_become_pages(tmp_path: Path) -> None:
     """Execute all four notebooks in Jupyter with the bundled results."""
     pytest.importorskip("nbclient")
     out = tmp_path / "out"
-    assert main(["notebooks", "example", "--out", str(out)]) == 0
+    assert main(["notebooks", "example", "--output", str(out)]) == 0
     for name in NOTEBOOKS:
         page = (out / f"{name}.html").read_text()
         assert "data:image/png;base64" in page and "plab report notebooks" in page

@@ -43,7 +43,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write(results: Path, out: Path, *more: str) -> Path:
-    assert main(["html", "task=Move,Rope", str(results), "--out", str(out), *more]) == 0
+    assert main(["html", "task=Move,Rope", str(results), "--output", str(out), *more]) == 0
     return out / "index.html"
 
 

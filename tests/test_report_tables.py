@@ -300,7 +300,7 @@ AGREEMENT = {
     "name", ["authors", *(pytest.param(n, marks=pytest.mark.nightly) for n in EXAMPLES if n != "authors")]
 )
 def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
-    assert main(["tables", name, "--out", str(tmp_path)]) == 0
+    assert main(["tables", name, "--output", str(tmp_path)]) == 0
     # The runs with other yield stresses are for a figure of their own.
     count = len(load(name)) - 5 * (name == "release")
     # None of agreement without a method of the paper.

@@ -384,7 +384,7 @@ def test_the_papers_numbers_are_a_table(leaders) -> None:
 
 
 def test_the_page_shows_it_and_takes_no_text_for_html(folder: Path, tmp_path: Path) -> None:
-    assert leaderboard([str(folder), "--out", str(tmp_path)]) == 0
+    assert leaderboard([str(folder), "--output", str(tmp_path)]) == 0
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "&lt;b&gt;bold&lt;/b&gt;" in text and "<b>bold" not in text
     assert '<a href="https://example.org/mine" rel="nofollow noopener">plans</a>' in text

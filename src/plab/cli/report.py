@@ -1,6 +1,6 @@
 """The paper's tables and curves, notebooks and a page of all results, from result files alone.
 
-plab report tables results --out reports/tables
+plab report tables results --output reports/tables
 plab report curves runs.plab.zip.xz task=Rope,Move seed=0,1,2
 plab report notebooks example
 plab report tables first second --split folder
@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> None:
     add = parser.add_argument
     add("what", choices=("tables", "curves", "notebooks", "html"), help="kind of report")
     add_sources(parser, "runs to select, such as task=Rope,Move seed=0,1,2")
-    add("--out", type=folder, help="folder to write to (default: reports/<what>)")
+    add("--output", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by plab bench speed --paper --csv, for the table of times"
     add("--speed", type=Path, help=what)
     what = "notebooks: folder of speed.csv and accuracy.csv; example: the bundled ones (default: "
@@ -54,7 +54,7 @@ def main(argv: Sequence[str]) -> None:
             f"{where} has no finished runs: start one with plab run task=Move, or show the bundled runs with "
             "results=example"
         )
-    out = options.out or Path("reports") / options.what
+    out = options.output or Path("reports") / options.what
     command = shlex.join(["plab", "report", *argv])
     if options.what == "tables":
         benchmark = None if options.speed is None else read_benchmark(options.speed, SPEED)

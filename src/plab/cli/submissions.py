@@ -148,7 +148,7 @@ def leaderboard(argv: Sequence[str]) -> None:
     """Write a static page for a folder of submissions: tracks, equal budgets, a table per protocol.
 
     plab leaderboard submissions
-    plab leaderboard submissions --out public/leaderboard
+    plab leaderboard submissions --output public/leaderboard
 
     Run plab verify on the folder first; the page shows its stored outcomes. The page is index.html, and needs
     no server.
@@ -158,7 +158,7 @@ def leaderboard(argv: Sequence[str]) -> None:
     what = "settings of your own leaderboard, such as sim.grid_size=32"
     parser.add_argument("overrides", nargs="*", help=what)
     what = "folder to write to (default: reports/leaderboard)"
-    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
+    parser.add_argument("--output", type=folder, default=Path("reports/leaderboard"), help=what)
     options = parser.parse_intermixed_args(argv)
     sections, left_out = board(options.folder, options.overrides)
     html = render(
@@ -178,7 +178,7 @@ def leaderboard(argv: Sequence[str]) -> None:
             "overrides": options.overrides,
         },
     )
-    path = options.out / "index.html"
+    path = options.output / "index.html"
     replace_file(path, html)
     for line in left_out:
         print_error(f"left out: {line}")
