@@ -22,7 +22,7 @@ import pandas as pd
 
 from common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.bench.accuracy import angle
-from plab.cli.command import Parser, command_line, measure_table, positive, task_list, to_write
+from plab.cli.command import Parser, command_line, measure_table, positive, to_write
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
@@ -177,7 +177,7 @@ def main(argv: Sequence[str]) -> None:
     """Compare float32 with float64, print rows, and write the requested files."""
     parser = Parser("precision", __doc__)
     parser.prog = "python benchmarks/precision.py"
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
+    parser.add_argument("--task", nargs="+", choices=suite_tasks(), default=suite_tasks(), help="tasks")
     parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
     parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
     parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")

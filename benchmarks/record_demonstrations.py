@@ -1,7 +1,7 @@
 """Recorder of the suite's best known actions: the bundled actions, or better ones from given results.
 
     python benchmarks/record_demonstrations.py results
-    python benchmarks/record_demonstrations.py results --task Move,Rope sim.device=cuda
+    python benchmarks/record_demonstrations.py results task=Move,Rope sim.device=cuda
 
 writes ``<Task>.csv`` and ``scores.csv`` to the folder of ``plab.demonstrations``.
 """
@@ -15,10 +15,9 @@ import numpy as np
 import pandas as pd
 
 from plab import demonstrations
-from plab.cli.command import Parser, sources_and_words, task_list
-from plab.cli.suite import ReplayedDemonstration, replay, variants
+from plab.cli.command import Parser, sources_and_words
+from plab.cli.suite import ReplayedDemonstration, by_task, replay
 from plab.config import Config, build_scene, load_config
-from plab.config.suite import suite_tasks
 from plab.demonstrations import SCORES, known_actions
 from plab.errors import ConfigError
 from plab.render.rollouts import stored
@@ -93,12 +92,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = Parser("record_demonstrations.py", __doc__)
     parser.add_argument("sources", nargs="*", help="results, and overrides such as sim.device=cuda")
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     options = parser.parse_intermixed_args(sys.argv[1:] if argv is None else argv)
     sources, words = sources_and_words(options.sources, default=None)
     runs = rows(sources)[0] if sources else []
-    for task in options.task:
-        cfgs = variants(task, words)
+    for task, cfgs in by_task(words).items():
         if build_scene(cfgs[0]) != build_scene(load_config([f"task={task}", "variant=1"])):
             raise ConfigError("only the suite's own resolution is recorded: leave out what changes it")
         for item in best_known(cfgs, runs):

@@ -63,4 +63,4 @@ def test_policies_are_scored_in_unseen_scenes(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_every_quick_case_of_stability_survives() -> None:
-    assert stability.main(["--quick", "--precision", "float32"]) == 0
+    assert stability.main(["--quick", "sim.precision=float32"]) == 0

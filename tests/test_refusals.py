@@ -146,13 +146,13 @@ TOOLS = [
     (view, "--gallery task=Rope", "task=Rope"),
     (view, "task=Rope --output a.htm", "a.htm"),
     (export, "task=Rope --format usd", "usd"),
-    (targets, "--task Nope", "Nope"),
-    (targets, "--task Rope sim.grid_size=7", "sim.grid_size"),
-    (targets, "--task Rope --rebuild targets.source=files", "--rebuild"),
-    (demonstrations, "--task Move nowhere", "nowhere"),
+    (targets, "task=Nope", "Nope"),
+    (targets, "task=Rope sim.grid_size=7", "sim.grid_size"),
+    (targets, "task=Rope --rebuild targets.source=files", "--rebuild"),
+    (demonstrations, "task=Move nowhere", "nowhere"),
     (submit, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
     (speed.main, "--batch 0", "--batch"),
-    (accuracy.main, "--task Table", "Table"),
+    (accuracy.main, "task=Table", "Table"),
     (bench.main, "sped", "did you mean speed?"),
     (plab_main, "rnu", "choose from: run"),
 ]
@@ -171,7 +171,7 @@ IN_THE_WAY = [
     (render, "task=Rope --output blocked/a.png"),
     (view, "task=Rope --output blocked/a.html"),
     (export, "task=Rope --output blocked"),
-    (targets, "--task Rope --csv blocked/a.csv"),
+    (targets, "task=Rope --csv blocked/a.csv"),
     (speed.main, "--csv blocked/a.csv"),
 ]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from plab.cli.suite import moments
+from plab.cli.suite import by_task, moments
 from plab.config import load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
@@ -63,7 +63,7 @@ def test_targets_are_those_that_were_published(task, device):
 
     The tolerance covers the differences between float32 and float64, CPU and CUDA, with a margin.
     """
-    table = moments(task, [f"sim.device={device}"], rebuild=True)
+    table = moments(by_task([f"task={task}", f"sim.device={device}"])[task], rebuild=True)
     expected = pd.read_csv(MOMENTS, dtype={"variant": str}).query("task == @task")
     assert list(table["variant"]) == list(expected["variant"])
     np.testing.assert_allclose(table["mass"], expected["mass"], rtol=1e-5)

@@ -2,7 +2,7 @@
 
     plab bench accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
     plab bench accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
-    plab bench accuracy --task Move,Rope --device cuda
+    plab bench accuracy task=Move,Rope sim.device=cuda
 
 Settings differ in the number of substeps (from below the stability limit upwards), precision, material
 update (series or singular values), contact model, grid (with a constant number of particles per cell), and,
@@ -28,14 +28,15 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.command import Parser, command_line, folder, measure_table, task_list
+from plab.cli.command import Parser, command_line, folder, measure_table
 from plab.config import build_scene
 from plab.demonstrations import known_actions
 from plab.losses import make_terms
 from plab.objective import scores, spread_mass, target_sdf
 from plab.plugins import pandas as pd
-from plab.scenes import CONTACTS, DEVICES, LAWS, PRECISIONS, Body, Scene, sample_particles
+from plab.scenes import CONTACTS, LAWS, PRECISIONS, Body, Scene, sample_particles
 from plab.sim import Simulator
+from plab.sweep.execution import sweep_configs
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
 QUICK_TASKS = ("Move", "Rope")
@@ -270,15 +271,16 @@ def main(argv: Sequence[str]) -> None:
     add = parser.add_argument
     text = "coarser, fewer settings, 1000 particles instead of 10000, 20 steps"
     add("--quick", action="store_true", help=text)
-    text = f"tasks, comma-separated (all; {','.join(QUICK_TASKS)} with --quick)"
-    add("--task", type=task_list, help=text)
-    add("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
+    text = f"task (default: {','.join(TASKS)}; {','.join(QUICK_TASKS)} with --quick) and sim.device"
+    add("overrides", nargs="*", help=text)
     add("--output", type=folder, default=Path("accuracy"), help="folder to write to")
     options = parser.parse_intermixed_args(argv)
-    if unknown := set(options.task or ()) - set(TASKS):
+    default, output = QUICK_TASKS if options.quick else TASKS, options.output
+    cfgs = sweep_configs(options.overrides, {"task": default}, ("task", "sim.device"))
+    tasks = [cfg.task.name for cfg in cfgs]
+    if unknown := set(tasks) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
-    tasks, output = options.task or (QUICK_TASKS if options.quick else TASKS), options.output
-    found = rows(tasks, QUICK if options.quick else Plan(), options.device)
+    found = rows(tasks, QUICK if options.quick else Plan(), cfgs[0].sim.device)
     table = measure_table(COLUMNS, found, output / "accuracy.csv")
     with style():
         drawings = diagrams(pd.DataFrame(table))

@@ -19,13 +19,12 @@ from typing import Any
 
 from plab.bench.workload import FORWARD, GRADIENT, KINDS, REWARD, build, peak_rss_mb, time_calls
 from plab.cli.command import Parser, command_line, measure_table, positive, to_write
-from plab.config import Config, load_config
-from plab.config.overrides import parse, prepared
+from plab.config import Config
 from plab.config.suite import suite_tasks
 from plab.errors import print_error
 from plab.progress import show_line
 from plab.report.reference import paper_table
-from plab.sweep.execution import jobs_of
+from plab.sweep.execution import sweep_configs
 
 COLUMNS = (
     "task", "device", "precision", "batch", "grid", "particles", "what", "first_s", "median_ms", "min_ms",
@@ -112,10 +111,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     parser.add_argument("--paper", action="store_true", help="the paper's table next to ours")
     options = parser.parse_intermixed_args(argv)
-    words = prepared(options.overrides)
-    if "task" not in {one.key_or_group for one in parse(words)}:
-        words.append(f"task={','.join(suite_tasks()) if options.paper else 'Move'}")
-    cfgs = [load_config(own) for own in jobs_of(words, {})]
+    cfgs = sweep_configs(options.overrides, {"task": suite_tasks() if options.paper else ["Move"]})
     # Taichi restarts for each precision, so precision is the outer loop.
     cells = list(itertools.product(sorted(cfgs, key=lambda cfg: cfg.sim.precision), options.batch))
     quick = options.quick

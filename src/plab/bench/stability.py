@@ -2,8 +2,8 @@
 
     plab bench stability                      # everything, in both precisions
     plab bench stability --quick              # a few minutes on two cores
-    plab bench stability --precision float32 --csv cases.csv
-    plab bench stability --device cuda
+    plab bench stability sim.precision=float32 --csv cases.csv
+    plab bench stability sim.device=cuda
 
 Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
 steps, and first variants over 1000 steps. Every case is simulated forwards and backwards. A case passes if
@@ -25,8 +25,9 @@ from plab.cli.command import Parser, command_line, measure_table, print_table, t
 from plab.config import build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms
-from plab.scenes import CONTACTS, DEVICES, PRECISIONS
+from plab.scenes import CONTACTS, PRECISIONS
 from plab.sim import Simulator, State
+from plab.sweep.execution import sweep_configs
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
@@ -145,9 +146,9 @@ def main(argv: Sequence[str]) -> int:
     parser = Parser("plab bench stability", __doc__)
     what = "one variant of each task, 64 particles instead of 300"
     parser.add_argument("--quick", action="store_true", help=what)
-    parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
-    parser.add_argument("--device", choices=DEVICES, default="cpu")
+    parser.add_argument("overrides", nargs="*", help="sim.device and sim.precision (default: both)")
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     options = parser.parse_intermixed_args(argv)
-    each = (rows(precision, options.quick, options.device) for precision in options.precision)
+    cfgs = sweep_configs(options.overrides, {"sim.precision": PRECISIONS}, ("sim.device", "sim.precision"))
+    each = (rows(cfg.sim.precision, options.quick, cfg.sim.device) for cfg in cfgs)
     return summarise(measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv))

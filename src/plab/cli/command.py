@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from plab.config.selection import one_protocol, select
-from plab.config.suite import EXTENSION_TASKS, suite_tasks
 from plab.errors import (
     TRACEBACK,
     ArgumentError,
@@ -218,15 +217,6 @@ def positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise ArgumentTypeError(f"'{text}' must be a whole number of at least 1")
     return int(text)
-
-
-def task_list(text: str) -> list[str]:
-    """Parse comma-separated names of tasks."""
-    names, known = [name.strip() for name in text.split(",")], [*suite_tasks(), *EXTENSION_TASKS]
-    for name in names:
-        if name not in known:
-            raise ArgumentTypeError(f"there is no task '{name}'; {suggest(name, known)}")
-    return names
 
 
 def folder(text: str) -> Path:

@@ -3,41 +3,34 @@
 from __future__ import annotations
 
 import time
-from argparse import Namespace
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
-from plab.cli.command import Parser, command_line, print_table, task_list, to_write
-from plab.config import Config, build_scene, load_config
+from plab.cli.command import Parser, command_line, print_table, to_write
+from plab.config import Config, build_scene
 from plab.config.compose import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.files import cache_dir
 from plab.objective import Scores, mass_change, target_sdf
-from plab.problem import Problem, make_targets
+from plab.problem import Problem, make_targets, require_alike
 from plab.sim import Simulator
+from plab.sweep.execution import sweep_configs
 from plab.targets import EPISODE_STEPS
 
-
-def _options(parser: Parser, argv: Sequence[str]) -> Namespace:
-    """Add the shared arguments, and parse the command line."""
-    add = parser.add_argument
-    add("overrides", nargs="*", help="overrides of the configuration, such as sim.device=cuda")
-    add("--task", type=task_list, default=suite_tasks(), help="only these tasks, such as Torus,Rope")
-    options = parser.parse_intermixed_args(argv)
-    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks in --task are used: omit '{taken[0]}'")
-    return options
+OVERRIDES = "overrides as for plab run -m (default: all tasks and variants of the suite)"
 
 
-def variants(task: str, overrides: Sequence[str]) -> list[Config]:
-    """Return the checked configurations of a task's variants."""
-    cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
-    for cfg in cfgs:
+def by_task(overrides: Sequence[str]) -> dict[str, list[Config]]:
+    """Return the checked configurations of a sweep by task, by default of the whole suite."""
+    cfgs = defaultdict(list)
+    for cfg in sweep_configs(overrides, {"task": suite_tasks(), "variant": SUITE_VARIANTS}):
         check_sources(cfg)
+        cfgs[cfg.task.name].append(cfg)
     return cfgs
 
 
@@ -59,13 +52,12 @@ def demonstrations(argv: Sequence[str]) -> None:
     """Replay the best known actions of the suite and print their scores.
 
     plab demonstrations                          all of them
-    plab demonstrations --task Torus,Rope        only these
-
-    Overrides of the configuration, such as sim.device=cuda, may follow.
+    plab demonstrations task=Torus,Rope          only these
+    plab demonstrations sim.device=cuda          on the GPU
     """
     parser = Parser("plab demonstrations", demonstrations.__doc__)
-    options = _options(parser, argv)
-    tasks = [variants(task, options.overrides) for task in options.task]
+    parser.add_argument("overrides", nargs="*", help=OVERRIDES)
+    tasks = by_task(parser.parse_intermixed_args(argv).overrides).values()
     replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
     judged = ["IoU at start", "IoU of target", "score", "score at rest"]
     print_table(["task", "variant", "target", "steps", *judged], map(_row, replays))
@@ -98,20 +90,20 @@ def targets(argv: Sequence[str]) -> None:
     """Build, cache and describe the targets of the suite.
 
     plab targets                       all fifty
-    plab targets --task Torus,Rope     only these
+    plab targets task=Torus,Rope       only these
     plab targets --rebuild             simulate cached targets, too
     plab targets --csv moments.csv     also write the table to a file
 
-    Overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it
-    describes the targets of the original release.
+    With targets.source it describes the targets of the original release.
     """
     parser = Parser("plab targets", targets.__doc__)
+    parser.add_argument("overrides", nargs="*", help=OVERRIDES)
     parser.add_argument("--rebuild", action="store_true", help="simulate cached targets, too")
     parser.add_argument("--csv", type=to_write, help="also write the table to this file")
-    options = _options(parser, argv)
+    options = parser.parse_intermixed_args(argv)
     if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
         parser.error("--rebuild has no effect with targets.source: omit one of them")
-    table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])
+    table = pd.concat([moments(cfgs, options.rebuild) for cfgs in by_task(options.overrides).values()])
     print_table(list(table.columns), table.itertuples(index=False, name=None))
     print(f"simulated targets are cached in {cache_dir() / 'targets'}")
     if options.csv is not None:
@@ -119,12 +111,11 @@ def targets(argv: Sequence[str]) -> None:
         table.drop(columns="seconds").to_csv(options.csv, index=False, float_format="%.6g")
 
 
-def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:
+def moments(cfgs: Sequence[Config], rebuild: bool = False) -> pd.DataFrame:
     """Build the targets of a task and describe them.
 
     Args:
-        task: Name of a task of the suite.
-        overrides: Overrides of the configuration.
+        cfgs: Configurations of the task's variants.
         rebuild: Whether to simulate cached targets, too.
 
     Returns:
@@ -132,7 +123,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         standard deviation along x, y, z [domain units], fraction of the mass that has to move,
         mean distance of the initial mass from the target [domain units], average build time [s].
     """
-    cfgs = variants(task, overrides)
+    require_alike(cfgs)
     sim, scenes = cfgs[0].sim, [build_scene(cfg) for cfg in cfgs]
     start = time.perf_counter()
     simulator = Simulator(scenes, precision=sim.precision, device=sim.device)
@@ -140,14 +131,14 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
     seconds = (time.perf_counter() - start) / len(cfgs)
     starts = simulator.mass_tensor()
     rows = [
-        {"task": task, "variant": variant}
+        {"task": cfg.task.name, "variant": cfg.variant}
         | _moments(mass / scene.particle_mass)
         | {
             "moved": 0.5 * float(np.abs(mass_change(first, mass)).sum()),
             "distance": float((first / first.sum() * target_sdf(mass)).sum()),
             "seconds": seconds,
         }
-        for variant, mass, first, scene in zip(SUITE_VARIANTS, masses, starts, scenes, strict=True)
+        for cfg, mass, first, scene in zip(cfgs, masses, starts, scenes, strict=True)
     ]
     return pd.DataFrame(rows)
 

@@ -27,9 +27,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from plab import runners
 from plab.config import Config, ConfigError, build_scene
-from plab.config.compose import check_sources, compose, finish, hydra_app, require_runnable
+from plab.config.compose import check_sources, compose, finish, hydra_app, load_config, require_runnable
 from plab.config.families import family
-from plab.config.overrides import parse, swept
+from plab.config.overrides import parse, prepared, swept
 from plab.config.selection import OBSERVATION_KEYS
 from plab.config.suite import choices
 from plab.errors import PlabError, print_error
@@ -128,6 +128,27 @@ def jobs_of(
     values = ((one, swept(one, choices(one.key_or_group, config_dir))) for one in given.values())
     each = [[f"{one.get_key_element()}={value}" for value in own] for one, own in values]
     return [list(job) for job in itertools.product(*each)]
+
+
+def sweep_configs(
+    words: Sequence[str], defaults: Mapping[str, Sequence[str]], keys: Sequence[str] = ()
+) -> list[Config]:
+    """Return the checked configurations of a sweep.
+
+    Args:
+        words: Overrides.
+        defaults: Values by key for keys without an override.
+        keys: The only keys that have an effect; empty for all.
+
+    Raises:
+        plab.config.ConfigError: If an override is invalid or has no effect.
+    """
+    words = prepared(words)
+    given = {one.key_or_group: one.input_line for one in parse(words)}
+    if without := [line for key, line in given.items() if keys and key not in keys]:
+        raise ConfigError(f"'{without[0]}' has no effect here; choose from: {', '.join(keys)}")
+    added = [f"{key}={','.join(values)}" for key, values in defaults.items() if key not in given]
+    return [load_config(job) for job in jobs_of([*words, *added], {})]
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
