@@ -60,8 +60,7 @@ def test_methods_differ_only_where_their_files_say():
 @pytest.mark.parametrize(("task", "variant"), VARIANTS)
 def test_every_variant_is_a_valid_scene(task, variant):
     scene = build_scene(load_config([f"task={task}", f"variant={variant}"]))
-    assert scene.name == task
-    assert scene.youngs_modulus == 5000
+    assert scene.name == task and scene.youngs_modulus == 5000
     assert scene.poisson_ratio == (0.05 if task == "Table" else 0.2)
     assert scene.gravity == (0, -150 if task == "Chopsticks" else -30, 0)
     assert (scene.grid_size, scene.dt, scene.substeps, scene.horizon) == (64, 1e-4, 19, 50)
@@ -70,8 +69,7 @@ def test_every_variant_is_a_valid_scene(task, variant):
 
 def test_a_loaded_configuration_is_plain_and_holds_its_own_variant_only():
     cfg = load_config(["task=Move", "variant=3"])
-    assert cfg.task.bodies["ball"].size == [0.10759]
-    assert list(cfg.task.variants) == ["3"]
+    assert cfg.task.bodies["ball"].size == [0.10759] and list(cfg.task.variants) == ["3"]
     assert json.loads(json.dumps(dataclasses.asdict(cfg))) == dataclasses.asdict(cfg)
     cfg.variant = "4"
     with pytest.raises(ConfigError, match="variant 4 of task Move does not exist; choose from: 3"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import plab
 from plab.cli.dataset import main
 from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
+from plab.plugins import load_object
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path
 from same_runs import CACHE, finished_as, run, stopped_at
@@ -82,6 +84,12 @@ def cloned(folder: Path, *words: str) -> Config:
     small = ["method.episodes=18", "method.evaluate_every=9", "method.hidden=[8]", "method.shift=0.1"]
     scene = ["task=Move", "variant=random", "seed_scene=9000"]
     return load_config([*scene, "method=bc", place, *COARSE, *small, *words])
+
+
+def test_the_nearest_neighbour_repeats_the_actions_of_a_dataset() -> None:
+    policy: Any = load_object("examples.nearest_neighbour:NearestNeighbour", type)("example")
+    for one in read_episodes("example"):
+        assert np.array_equal(policy(one.observations[:-1]), one.actions)
 
 
 def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path) -> None:

@@ -89,8 +89,7 @@ def test_a_scripted_demonstration_reaches_its_target_and_rest_does_not(device):
     for least, *words in ((0.95, "RollingPin", "1"), (0.95, "RollingPin", "4"), (0.5, *random)):
         cfg = config(*words, *COARSE, f"sim.device={device}")
         (item,) = replay([cfg], [known_actions(cfg)])
-        assert item.scores.score > least
-        assert item.idle.score < 0.5
+        assert item.scores.score > least and item.idle.score < 0.5
 
 
 def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records):

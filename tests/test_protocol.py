@@ -207,8 +207,7 @@ def test_a_run_on_the_users_targets(tmp_path: Path, device: str, monkeypatch) ->
     run_config(cfg)
     (row,) = rows(results)[0]
     run = read(row.path)
-    assert run.config["protocol"]["name"] == "release"
-    assert run.masses.keys() == {"initial", "final"}
+    assert run.config["protocol"]["name"] == "release" and run.masses.keys() == {"initial", "final"}
     assert [problem for _, problem in check(results)] == [""]
     path = row.path
     again = record(*result(path))

@@ -92,8 +92,7 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
 def test_surfaces_enclose_the_volume_of_bodies_and_targets_and_follow_particles(body):
     x = sample_particles(scene(bodies=(body,)))
     mesh = shapes.body_mesh(body, x)
-    assert mesh.is_manifold
-    assert mesh.volume == pytest.approx(body.volume, rel=0.1)
+    assert mesh.is_manifold and mesh.volume == pytest.approx(body.volume, rel=0.1)
     assert mesh.center_of_mass() == pytest.approx(x.mean(axis=0), abs=0.004)
     # Within a particle spacing.
     assert np.abs(mesh.points - body.center).max(axis=0) == pytest.approx(body.half_extent(), abs=0.022)
