@@ -14,6 +14,7 @@ from plab.results.examples import measurements
 
 LABELS = {
     "bc": "bc, cloned",
+    "nearest neighbour": "nearest neighbour",
     "pods": "pods, trained with gradients",
     "ppo": "ppo, trained with rewards",
     "adam": "adam, plan per scene",
@@ -24,12 +25,15 @@ tasks = list(table.task.unique())
 figure, axes = plt.subplots(figsize=(9.0, 3.4), layout="constrained")
 for k, (name, label) in enumerate(LABELS.items()):
     rows = table[table.method == name]
-    places = [tasks.index(task) + 0.21 * (k - 1.5) for task in rows.task]
-    axes.bar(places, rows.score, 0.19, label=label, color=method(name).colour)
+    places = [tasks.index(task) + 0.17 * (k - 2) for task in rows.task]
+    colour = "#999999" if name == "nearest neighbour" else method(name).colour
+    axes.bar(places, rows.score, 0.15, label=label, color=colour)
     errors = np.abs(rows[["lower", "upper"]].to_numpy().T - rows.score.to_numpy())
     axes.errorbar(places, rows.score, errors, fmt="none", ecolor="#333333", elinewidth=1, capsize=2)
 axes.set(ylabel="score in unseen scenes", ylim=(0, 1), xlim=(-0.6, len(tasks) - 0.4))
 axes.set_xticks(range(len(tasks)), tasks, fontsize=8.5)
 axes.spines[["top", "right"]].set_visible(False)
-axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+axes.legend(
+    loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, frameon=False, fontsize=8, columnspacing=1.2
+)
 figure.savefig(sys.argv[1], dpi=110)
