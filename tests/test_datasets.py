@@ -29,6 +29,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
     (folder / "cameras.yaml").write_text("top: {position: [0.5,2,0.5], target: [0.5,0,0.5], size: [8, 4]}")
     words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "task.floor_friction=2", *SEARCH]
+    words.append("method.loss_weights.sdf=3")
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder
@@ -49,6 +50,11 @@ def test_an_episode_is_what_its_environment_gives(written: Path) -> None:
         assert np.array_equal(np.stack([seen[key] for seen, _ in steps]), first.observations[key])
     assert np.array_equal([reward for _, reward in steps[1:]], first.rewards)
     assert not np.array_equal(first.observations["state"], others[0].observations["state"])
+    # Of results, the rewards are those of the usual loss, whose weight of sdf is 10.
+    assert main([f"{written}/results", "variant=random1000", "--output", f"{written}/again"]) == 0
+    (again,) = read_episodes(written / "again/plab/Move-v0")
+    assert again.attributes["score"] == first.attributes["score"]
+    assert again.infos["loss"][0] > 1.1 * first.infos["loss"][0]
 
 
 def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +71,7 @@ def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> None:
     ranges = ["yield_stress=[20,200]", "bodies.ball.offset=[[0,0,0],[0.02,0,0]]", "scenes=2"]
-    words = ["task=Move", "variant=random", "seed_scene=1000", "seed=0,1", *SEARCH]
+    words = ["task=Move", "variant=random", "seed_scene=1000", *SEARCH[:3], "method.iterations=1,2"]
     drawn = [f"+task.randomize.{one}" for one in ranges]
     assert main([*words, *drawn, f"results_dir={tmp_path}", *COARSE, "--output", str(tmp_path)]) == 0
     kwargs = json.loads(metadata_of(tmp_path / "plab/Move-v0")["env_spec"])["kwargs"]
@@ -136,6 +142,16 @@ def test_parameters_are_found_from_observations(tmp_path: Path, observation: str
     finished_as(again, result)
     with pytest.raises(ConfigError, match=r"method\.parameters"):
         load_config([*words, *fit, "method.parameters=[mass]"])
+
+
+def test_a_fitted_poisson_ratio_is_possible(tmp_path: Path) -> None:
+    words = ["task=Torus", *COARSE, f"results_dir={tmp_path}"]
+    stuff = ["task.youngs_modulus=300", "task.poisson_ratio=0.45"]
+    assert main([*words, "variant=1", *stuff, "--output", str(tmp_path)]) == 0
+    fit = ["method=identify", f"method.dataset={tmp_path}/plab/Torus-v0", "method.parameters=[poisson_ratio]"]
+    rows = run(load_config([*words, *fit, "method.iterations=4", "task.youngs_modulus=180"])).iterations
+    found = rows[["poisson_ratio", "poisson_ratio_deviation"]].to_numpy()[1:]
+    assert np.isfinite(found).all() and 0.3 < found[:, 0].min() <= found[:, 0].max() <= 0.49
 
 
 def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from argparse import Namespace
 from collections import defaultdict
@@ -122,7 +123,7 @@ def _demonstrations(options: Namespace) -> list[Demonstration]:
     config_dir = options.config_dir
     check_overrides([], config_dir)
     if sources:
-        return _of_results(sources, words)
+        return _of_results(sources, words, config_dir)
     from plab.sweep.execution import compose_jobs, jobs_of
 
     given = {one.key_or_group for one in parse(prepared(words))}
@@ -161,9 +162,11 @@ def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]
     return [Demonstration(cfg, best, cfg.method.name) for cfg, best in done if best is not None]
 
 
-def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstration]:
+def _of_results(sources: Sequence[Path], words: Sequence[str], config_dir: str | None) -> list[Demonstration]:
+    """Return the best actions of runs, with the loss of the task's environment for comparable rewards."""
     from plab.render.rollouts import result
 
+    compose = functools.cache(lambda *keys: load_config(keys, config_dir))
     parsed = {one.key_or_group: one for one in parse(prepared(words))}
     rows = finished_rows(sources, [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED])
     changes = {key: one.value() for key, one in parsed.items() if key in REPLAYED}
@@ -175,6 +178,10 @@ def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstra
     for row in rows:
         cfg, actions = result(row.path)
         seen = {key: row.config[key] for key in OBSERVATION_KEYS} | own
+        if cfg.task.name not in choices("task", config_dir):
+            raise ArgumentError(f"{cfg.task.name} is a task of your own: add --config-dir with its folder")
+        protocol = f"protocol={cfg.protocol.name}", f"protocol.contact={cfg.protocol.contact}"
+        seen |= {"method": compose(f"task={cfg.task.name}", *protocol).method}
         cfg = replace(cfg, sim=replace(cfg.sim, **sim), seed_scene=row.config.get("seed_scene"), **seen)
         cfg.check()
         check_sources(cfg)
@@ -205,7 +212,7 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
         filled = [part[k % len(part)] for k in range(batch.size)]
         if first:
             batch.renew([one.cfg for one in filled])
-        observation, info = batch.reset()
+        observation, info = batch.reset(episode=first + np.arange(batch.size))
         actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
         if (length := actions.shape[1]) != batch.horizon:
             known = f"the known actions of {part[0].cfg.task.name} have {length} steps"
@@ -232,16 +239,16 @@ def _episodes(demonstrations: Sequence[Demonstration], batch: EpisodeBatch) -> I
 
 def _env_spec(cfg: Config, observe: str | list[str], cameras: Any, config_dir: str | None) -> EnvSpec:
     """Return the specification of an environment, for minari's ``recover_environment``."""
-    if cfg.task.name not in choices("task", config_dir):
-        raise ArgumentError(f"{cfg.task.name} is a task of your own: add --config-dir with its folder")
     variant, words = cfg.variant, [f"protocol={cfg.protocol.name}"]
     if cfg.seed_scene is not None:
         variant, words = RANDOM, [*words, f"seed_scene={cfg.seed_scene}"]
     usual = load_config([f"task={cfg.task.name}", f"variant={variant}", *words], config_dir)
-    values, simulated = dict(leaves(asdict(usual))), ("task.", "sim.", "protocol.", "targets.")
+    values, loss = dict(leaves(asdict(usual))), ("method.loss_weights.", "method.loss_terms.")
+    written = "task.", "sim.", "protocol.", "targets.", "seed_particles", *OBSERVATION_KEYS
     task = replace(cfg.task, variants=usual.task.variants, randomize=usual.task.randomize)
     for key, value in leaves(asdict(replace(cfg, task=task))):
-        if value != values.get(key) and key.startswith((*simulated, "seed_particles", *OBSERVATION_KEYS)):
+        # The usual loss depends on other overrides.
+        if key.startswith(loss) or (value != values.get(key) and key.startswith(written)):
             # A variant would replace other overrides of the task.
             place = key if variant == RANDOM else key.replace("task.", f"task.variants.{variant}.", 1)
             text = "null" if value is None else quoted(value) if isinstance(value, str) else value

@@ -368,7 +368,7 @@ class EpisodeBatch:
         *,
         environments: Sequence[int] | np.ndarray | None = None,
         seeds: Sequence[int] | None = None,
-        episode: int | None = None,
+        episode: int | np.ndarray | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Start the next episodes of all or some sub-environments.
@@ -377,7 +377,7 @@ class EpisodeBatch:
             like: If a CUDA tensor, results are CUDA tensors.
             environments: Numbers of the sub-environments to reset; default: all.
             seeds: Seeds of these environments, which restart their random sequences; default: continue.
-            episode: Episode number, which determines the samples; default: the next.
+            episode: Number of the episode, or of each, which determines the samples; default: the next.
             options: Values by dotted key of the task that replace samples, for all of these sub-environments
                 or, with a first axis of the batch's length, one for each.
 

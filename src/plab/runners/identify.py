@@ -140,7 +140,9 @@ class IdentifyRunner(Runner):
         first = [_value(self.problem.scenes[0], name) for name in self.method.parameters]
         if min(first) <= 0.0:
             raise ConfigError("fitted parameters must be positive initially")
-        logs, count = np.log(first), len(first)
+        highest = {"poisson_ratio": math.log(HIGHEST_POISSON_RATIO)}
+        self._highest = np.array([highest.get(name, math.inf) for name in self.method.parameters])
+        logs, count = np.minimum(np.log(first), self._highest), len(first)
         self._state: dict[str, Any] = {"trial": logs, "best": logs, "cost": np.inf}
         linear = {"curvature": np.zeros((count, count)), "slope": np.zeros(count)}
         self._state |= {"damping": self.method.damping} | linear
@@ -152,12 +154,13 @@ class IdentifyRunner(Runner):
         method, state = self.method, self._state
         changes = np.eye(len(method.parameters)) * method.difference
         trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
-        seen, measured = self._simulate(np.exp(trials))
+        seen, measured = self._simulate(np.exp(np.minimum(trials, self._highest)))
         residual = (seen[0] - self._observed).ravel()
         cost = float(residual @ residual)
         if cost < state["cost"]:
             up, down = np.split(seen[1:].reshape(2 * len(changes), -1), 2)
-            slopes = (up - down) / (2.0 * method.difference)
+            beyond = np.maximum(state["trial"] + method.difference - self._highest, 0.0)
+            slopes = (up - down) / (2.0 * method.difference - beyond)[:, None]
             linear = {"curvature": slopes @ slopes.T, "slope": slopes @ residual}
             state |= {"best": state["trial"], "cost": cost, "damping": state["damping"] / 3.0} | linear
         else:
@@ -165,7 +168,8 @@ class IdentifyRunner(Runner):
         damped = state["curvature"] + state["damping"] * np.diag(np.diag(state["curvature"]))
         way = np.linalg.lstsq(damped, -state["slope"], rcond=None)[0]
         # A step changes parameters by at most a factor of 2.
-        state["trial"] = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
+        trial = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
+        state["trial"] = np.minimum(trial, self._highest)
         variance = state["cost"] / max(residual.size - len(changes), 1)
         deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
         # Parameters without effect, such as floor friction while bodies stick.
@@ -229,8 +233,6 @@ def _changed(scene: Scene, names: list[str], values: np.ndarray) -> Scene:
     if "manipulator_friction" in changes:
         friction = changes.pop("manipulator_friction")
         changes["manipulators"] = tuple(replace(own, friction=friction) for own in scene.manipulators)
-    if "poisson_ratio" in changes:
-        changes["poisson_ratio"] = min(changes["poisson_ratio"], HIGHEST_POISSON_RATIO)
     return replace(scene, **changes)
 
 
