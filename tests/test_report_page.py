@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import urllib.parse
 from pathlib import Path
 
@@ -12,12 +13,13 @@ import pytest
 import synthetic
 from browsing import browsing, press, until
 from plab.cli.report import main
+from plab.config import load_config
 from plab.config.selection import select
 from plab.render.graphics import missing_graphics
 from plab.report.collect import NAMES, collect
 from plab.report.methods import method
-from plab.report.page import best_runs
-from plab.results import load
+from plab.report.page import _command, best_runs
+from plab.results import config_dict, load
 from synthetic_runs import synthetic_run, template
 from toy_runner import COARSE
 
@@ -36,8 +38,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of two methods on two variants, two seeds for one of them."""
     folder = tmp_path_factory.mktemp("results")
     for variant in "12":
-        for seed in range(2):
-            coarse_run(folder, variant, "adam", seed, 0.5 + 0.1 * seed + 0.05 * int(variant))
+        for number, seed in enumerate((2, 10)):
+            coarse_run(folder, variant, "adam", seed, 0.5 + 0.1 * number + 0.05 * int(variant))
         coarse_run(folder, variant, "gd", 0, 0.9 if variant == "1" else 0.2)
     return folder
 
@@ -63,24 +65,24 @@ def test_page_has_runs_and_what_is_missing(results: Path, page: Path) -> None:
     assert set(known) == {f"{task}-v{variant}" for task in ("Rope", "Move") for variant in "12345"}
     adam = known["Rope-v1"]["adam"]
     assert adam["ours"]["mean"] == pytest.approx(0.6) and adam["ours"]["std"] == pytest.approx(0.05)
-    assert (adam["ours"]["count"], adam["ours"]["expected"]) == (2, 3)
+    assert (adam["ours"]["count"], adam["ours"]["expected"]) == (2, 4)
     assert adam["paper"]["mean"] == 0.66 and adam["difference"][0] == pytest.approx(0.6 - 0.66)
     assert known["Move-v1"]["adam"]["ours"]["mean"] is None
     assert known["Rope-v1"]["gd"]["difference"][1:] == [None, None]
     (line,) = shown["tasks"]
     assert line["task"] == "Rope" and line["cells"]["adam"]["ours"]["count"] == 4
     assert line["cells"]["adam"]["ours"]["mean"] == pytest.approx((0.55 + 0.65 + 0.6 + 0.7) / 4)
-    assert line["cells"]["adam"]["ours"]["expected"] == 15
+    assert line["cells"]["adam"]["ours"]["expected"] == 20
     (best,) = shown["gallery"]
     assert (best["name"], best["method"], best["seed"], best["score"]) == ("Rope-v1", "gd", "0", 0.9)
     best = best_runs(collect(results, select(["task=Rope"], NAMES)))
     assert [one.name for one in best] == ["Rope-v1", "Rope-v2"]
-    assert [best[0].runs[name]["seed"] for name in ("adam", "gd")] == ["1", "0"]
+    assert [best[0].runs[name]["seed"] for name in ("adam", "gd")] == ["10", "0"]
 
     assert "plab report html" in text
     assert collect(results, select(["task=Move,Rope"], NAMES)).digest in text
     assert all(name in text for name in load(results)["config_hash"])
-    assert "6 of 60 runs, 1 of 2 tasks" in text
+    assert "6 of 80 runs, 1 of 2 tasks" in text
     places = {look["name"]: look["css"] for look in shown["methods"]}
     for name in ("sac", "adam", "gd"):
         assert f"--{places[name]}: {method(name).colour};" in text
@@ -93,8 +95,21 @@ def test_details_have_curves_runs_and_commands(page: Path) -> None:
     x, mean, std = details["adam"]["curves"]["reward"]["episodes"]
     assert x[0] == 1 and x[-1] == 6 and len(mean) == len(std) == len(x)
     command = details["adam"]["runs"][1]["command"]
-    assert command.startswith("plab run task=Rope variant=1 method=adam seed=1")
+    assert command.startswith("plab run task=Rope variant=1 method=adam seed=10")
     assert "sim.particles_scale=0.03" in command and "sim.horizon=3" in command
+
+
+REPEATED = (
+    "method=ppo method.name=ppo_fast method.num_envs=4",
+    "method=ppo variant=2 +task.randomize.bodies.ball.yaw=[0,1] +task.randomize.scenes=4",
+    "method=mpc method@method.planner=gd method.planner.iterations=3 method.window=9",
+)
+
+
+@pytest.mark.parametrize("words", REPEATED)
+def test_the_command_of_a_run_repeats_it(words: str) -> None:
+    config = config_dict(load_config(["task=Move", *words.split()]))
+    assert config_dict(load_config(shlex.split(_command(config))[2:])) == config
 
 
 def test_text_of_a_result_cannot_become_a_part_of_the_page(tmp_path: Path) -> None:

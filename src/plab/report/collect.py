@@ -240,7 +240,8 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     own = {key: lookup(config, key) for key in expected if key not in by_variant}
     # None where the run has no such setting.
     own = {key: None if value != value else value for key, value in own.items()}
-    return {key: value for key, value in own.items() if value != expected[key]}
+    own |= {key: value for key, value in leaves(config["task"].get("randomize"), "task.randomize") if value}
+    return {key: value for key, value in own.items() if value != expected.get(key)}
 
 
 @functools.cache

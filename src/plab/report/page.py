@@ -21,6 +21,7 @@ from typing import Any
 import pandas as pd
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
+from plab.config.suite import choices
 from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
 from plab.report.statistics import AXES, Rows, Series, band, load_series
@@ -147,7 +148,7 @@ def _details(shown: Shown, runs: Runs, series: Series) -> dict[str, Any]:
     own = table[(table["task"] == shown.task) & (table["variant"] == shown.variant)]
     found = {}
     for name in shown.runs:
-        rows = own[own["method"] == name].sort_values("seed")
+        rows = own[own["method"] == name].sort_values("seed", key=lambda seeds: seeds.astype(int))
         iterations = [series[index][1] for index in rows.index]
         found[name] = {
             "best": shown.runs[name]["config_hash"],
@@ -176,15 +177,27 @@ def _command(config: Mapping[str, Any]) -> str:
     """Return the command that repeats a run."""
     drawn = config.get("seed_scene")
     variant = config["variant"] if drawn is None else f"random seed_scene={drawn}"
+    method, files = config["method"], choices("method")
+    # An experiment may rename the method of a file.
+    file = next((n for n in (method["name"], method.get("algorithm")) if n in files), method["name"])
+    changed = changed_settings({**config, "method": {**method, "name": file}})
     words = [f"task={config['task']['name']}", *f"variant={variant}".split()]
-    words += [f"method={config['method']['name']}", f"seed={config['seed']}"]
-    if config["protocol"]["name"] != "plab":
-        words.append(f"protocol={config['protocol']['name']}")
-    if config["sim"]["device"] != "cpu":
-        words.append(f"sim.device={config['sim']['device']}")
-    for key, value in changed_settings(config).items():
+    words += [f"method={file}", f"seed={config['seed']}"]
+    own = {"method.name": method["name"], "protocol": config["protocol"]["name"]}
+    own["sim.device"] = config["sim"]["device"]
+    usual = {"method.name": file, "protocol": "plab", "sim.device": "cpu"}
+    words += [f"{key}={value}" for key, value in own.items() if value != usual[key]]
+    if "method.planner.name" in changed:
+        # Another planner has other keys.
+        words.append(f"method@method.planner={changed['method.planner.name']}")
+        changed = {key: value for key, value in changed.items() if not key.startswith("method.planner.")}
+        of_planner = changed_settings({**config, "method": method["planner"]})
+        changed |= {key.replace("method", "method.planner"): value for key, value in of_planner.items()}
+    for key, value in changed.items():
         text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-        words.append(f"{key}={text.replace('Infinity', '.inf')}")
+        # Only the keys of this section may be missing.
+        sign = "++" if key.startswith("task.randomize.") else ""
+        words.append(f"{sign}{key}={text.replace('Infinity', '.inf')}")
     return shlex.join(["plab", "run", *words])
 
 
