@@ -85,7 +85,7 @@ def relative_error(got: np.ndarray, want: np.ndarray) -> float:
     return float(np.abs(got - want).max() / np.abs(want).max())
 
 
-def assert_agreement(got: Results, want: Results, tolerance: float) -> None:
+def assert_alike(got: Results, want: Results, tolerance: float) -> None:
     """Compare results with a tolerance, and print the errors (``pytest -s``)."""
     errors = {name: relative_error(got[name], want[name]) for name in want}
     print(", ".join(f"{name} {error:.1e}" for name, error in errors.items()))
@@ -115,8 +115,8 @@ def assert_cuda_agrees_with_the_cpu(contact: str) -> None:
         if device == "cpu":
             wants = results
     for got, want in zip(results, wants, strict=True):
-        assert_agreement(got, want, 1e-10)
+        assert_alike(got, want, 1e-10)
     # Room for the states of two environment steps of three, and two checkpoints.
     fewer = (SCENES[0].substeps - 2) * simulator._particles.slot_bytes
     simulator.memory_mb = (simulator.memory_bytes() - fewer) / 1e6
-    assert_agreement(computed(simulator), results[1], 1e-10)
+    assert_alike(computed(simulator), results[1], 1e-10)

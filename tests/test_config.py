@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hydra import compose, initialize_config_dir
 
-from plab.config import Config, ConfigError, build_scene, choices, conf_folder, load_config
+from plab.config import Config, ConfigError, build_scene, choices, load_config, plab_folder
 from plab.scenes import SceneError
 from refusals import why
 
@@ -143,7 +143,7 @@ def test_values_by_task_and_protocol():
 
 
 def test_load_config_leaves_a_surrounding_hydra_alone():
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with initialize_config_dir(str(plab_folder()), version_base="1.3"):
         load_config(["seed=1"])
         assert compose("config", overrides=["seed=2"]).seed == 2
 

@@ -7,15 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuda_scenes import (
-    ALL,
-    actions_of,
-    assert_agreement,
-    assert_same_bits,
-    computed,
-    results_of,
-    simulator_of,
-)
+from cuda_scenes import ALL, actions_of, assert_alike, assert_same_bits, computed, results_of, simulator_of
 from plab.config import load_config
 from plab.problem import Problem
 from plab.results import read
@@ -30,7 +22,7 @@ def test_float64_has_the_same_bits_and_computes_what_the_cpu_does() -> None:
     """Two integers per number of the grids have the digits of float64."""
     got, again = results_of(ALL, "float64", "all", times=2)
     assert_same_bits(again, got)
-    assert_agreement(got, computed(simulator_of(ALL, "float64", "all", device="cpu")), 1e-10)
+    assert_alike(got, computed(simulator_of(ALL, "float64", "all", device="cpu")), 1e-10)
 
 
 def test_strong_momentum_is_within_range_of_the_integers() -> None:

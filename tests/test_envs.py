@@ -27,7 +27,7 @@ from torch.utils._pytree import tree_leaves
 import plab
 import plab.envs.core as core
 import plab.sim.runtime as runtime
-from plab.config import Config, ConfigError, choices, conf_folder
+from plab.config import Config, ConfigError, choices, plab_folder
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
@@ -81,7 +81,7 @@ def random_actions(steps: int = HORIZON, seed: int = 0) -> np.ndarray:
 
 
 def test_ids_are_those_of_the_conf_folder() -> None:
-    files = [conf_folder() / "task" / f"{task}.yaml" for task in choices("task")]
+    files = [plab_folder() / "task" / f"{task}.yaml" for task in choices("task")]
     expected = {f"plab/{path.stem}-v{v}" for path in files for v in OmegaConf.load(path).variants}
     assert {env_id for env_id in gymnasium.registry if env_id.startswith("plab/")} == expected
 

@@ -24,7 +24,7 @@ from torch.distributions import normal
 from plab.config import Config, load_config
 from plab.runners.agents import Agents, OffPolicyConfig, ReplayBuffer, Sizes
 from plab.runners.policy import CLIP, Spaces, first_policy, torch_settings
-from plab.runners.rl import agents_of
+from plab.runners.rl import FAMILY
 from plab.runners.sb3 import off_policy
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
@@ -72,7 +72,8 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
     words = ["task=Move", f"sim.horizon={HORIZON}", f"method.num_envs={ENVS}", "method.episodes=16"]
     words += ["method.hidden=[8,8]", *LEARNERS[name]]
     cfgs = [load_config([*words, f"seed={seed}"]) for seed in range(3)]
-    return agents_of(cfgs[0].method)(cfgs, SPACES, torch.device(device), STEPS * ENVS), cfgs
+    kind = FAMILY.rules[cfgs[0].method.algorithm].what
+    return kind(cfgs, SPACES, torch.device(device), STEPS * ENVS), cfgs
 
 
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:

@@ -13,18 +13,10 @@ from scipy import stats
 import synthetic
 from plab.cli.report import main
 from plab.config.selection import select
+from plab.report import statistics
 from plab.report.collect import NAMES, collect
 from plab.report.figures import rl_scores, style
-from plab.report.statistics import (
-    at_budgets,
-    band,
-    common_strata,
-    improvement,
-    interquartile_mean,
-    load_series,
-    rows_on_axes,
-    scores_at,
-)
+from plab.report.statistics import at_budgets, band, common_strata, improvement, interquartile_mean
 from plab.report.tables import score_at_budget
 
 
@@ -64,14 +56,14 @@ def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
     sim = {"horizon": 50, "substeps": 2}
 
     def table(family: str) -> pd.DataFrame:
-        return rows_on_axes({"method": {"family": family}, "sim": sim}, rows.assign(**budgets))
+        return statistics.rows_on_axes({"method": {"family": family}, "sim": sim}, rows.assign(**budgets))
 
     assert table("trajectory")["best_score"].tolist() == [0.4, 0.1, 0.1, 0.3]
     assert table("planner")["best_score"].tolist() == [0.4, 0.4, 0.6, 0.6]
     spent = table("planner")
     assert spent["simulated"].tolist() == [10, 25, 35, 50]
     assert spent["substeps"].tolist() == [20, 50, 70, 100]
-    found = scores_at(spent, np.array([9.0, 10.0, 34.0, 35.0, 1e6]))
+    found = statistics.scores_at(spent, np.array([9.0, 10.0, 34.0, 35.0, 1e6]))
     np.testing.assert_array_equal(found, [np.nan, 0.4, 0.4, 0.6, 0.6])
 
 
@@ -93,10 +85,9 @@ def test_an_interval_over_seeds_within_variants() -> None:
 
 def test_table_of_scores_at_equal_budgets(tmp_path: Path) -> None:
     for seed in range(2):
-        result = synthetic.run(tmp_path, method="adam", seed=seed)
-        synthetic.save(result)
+        synthetic.save(synthetic.run(tmp_path, method="adam", seed=seed))
     runs = collect(tmp_path, select([], NAMES))
-    (table,) = score_at_budget(runs, load_series(runs))
+    (table,) = score_at_budget(runs, statistics.load_series(runs))
     (cells,) = table.cells.to_dict("records")
     assert (cells["task"], cells["method"], cells["runs"]) == ("Rope", "Adam", "2")
     data = table.data.set_index("steps")

@@ -11,7 +11,8 @@ import pytest
 import synthetic
 from plab.bench import accuracy, speed
 from plab.cli.report import main
-from plab.report.notebooks import NOTEBOOKS, notebook_folder
+from plab.config.suite import plab_folder
+from plab.report.notebooks import NOTEBOOKS
 from plab.report.reference import ACCURACY, SPEED, Benchmark, origin, read_benchmark
 from plab.results import ResultsError
 from plab.results.examples import measurements
@@ -73,7 +74,7 @@ def run_cells(name: str, monkeypatch: pytest.MonkeyPatch, **parameters: object) 
         monkeypatch.setattr(f"{place}.display", lambda thing: shown.append(str(thing.data)))
     assert display
     space: dict[str, object] = {}
-    for cell in jupytext.read(notebook_folder() / f"{name}.py").cells:
+    for cell in jupytext.read(plab_folder("reports") / f"{name}.py").cells:
         if cell.cell_type == "code":
             exec(compile(cell.source, name, "exec"), space)
         if "parameters" in cell.metadata.get("tags", []):

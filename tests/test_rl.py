@@ -25,7 +25,7 @@ from plab.objective import scores
 from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, run_batch, run_config, sb3, training
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path
-from plab.runners.rl import RlRunner, agents_of
+from plab.runners.rl import FAMILY, RlRunner
 from plab.runners.runner import Outcome, episode_columns
 from plab.runners.sb3 import Sb3Runner
 from plab.runners.training import evaluate, shared_batches
@@ -170,7 +170,7 @@ def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, meth
         assert set(got.wall_time) == {"build", "compile", "optimise", "evaluate"}
         assert np.isfinite(got.iterations[1:].to_numpy()).all()
         events = EventAccumulator(str(got.path.with_suffix(".tensorboard"))).Reload()
-        names = agents_of(cfg.method).LOSSES
+        names = FAMILY.rules[cfg.method.algorithm].what.LOSSES
         losses.append([events.Scalars(f"train/{name}")[-1].value for name in names])
     assert np.isfinite(losses).all() and losses[0] != losses[1] != losses[2]
     assert len({tuple(result.iterations["loss"]) for result in results}) == 3

@@ -25,7 +25,7 @@ import yaml
 from nbclient import NotebookClient
 
 from plab import config
-from plab.config.suite import conf_folder
+from plab.config.suite import plab_folder
 from plab.runners.agents import OffPolicyConfig, RlConfig
 from plab.runners.apg import ApgConfig
 from plab.runners.planner import PlannerConfig, StagesConfig
@@ -236,7 +236,7 @@ def _defaults(source: str | None) -> dict[str, Any]:
     if source is None:
         return {}
     name, _, section = source.partition(":")
-    content = yaml.safe_load((conf_folder() / name).read_text(encoding="utf-8"))
+    content = yaml.safe_load((plab_folder() / name).read_text(encoding="utf-8"))
     return content[section] if section else content
 
 

@@ -66,9 +66,7 @@ def rows(
             raise ArgumentError(
                 f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"
             )
-        batch = EpisodeBatch(
-            [drawn[k % len(drawn)] for k in range(min(together, len(drawn)))], observe=observe
-        )
+        batch = EpisodeBatch(drawn[:together], observe=observe)
         scores = scores_of(policy, drawn, batch)
         batch.close()
         mean, error = scores.mean(), stats.sem(scores)

@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from plab.cli.command import Parser, close_output, command_line, prompt_interrupts
-from plab.config import EXPERIMENT, GROUPS, ConfigError, choices, conf_folder, load_config
+from plab.config import EXPERIMENT, GROUPS, ConfigError, choices, load_config, plab_folder
 from plab.config.compose import check_overrides, check_sources, compose_with_hydra, require_runnable
 from plab.config.overrides import parse, prepared
 
@@ -109,7 +109,7 @@ def help_text(config_dir: str | None = None, *, full: bool = False) -> str:
     """Return the two-screen text of ``--help``: usage, flags, names of all choices, including the user's
     files in ``config_dir``, and frequent keys. The ``full`` text of ``--help-all`` has more examples, and the
     commented YAML file of each choice, with every key and its default."""
-    names, yaml = [], {"config": conf_folder() / "config.yaml"}
+    names, yaml = [], {"config": plab_folder() / "config.yaml"}
     for group in (*GROUPS, EXPERIMENT):
         start, found = f"{'+' if group == EXPERIMENT else ''}{group}=", choices(group, config_dir)
         indent = " " * (2 + len(start))

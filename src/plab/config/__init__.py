@@ -12,7 +12,7 @@ from plab.errors import ConfigError
 if TYPE_CHECKING:
     from plab.config.compose import *
     from plab.config.run import *
-    from plab.config.suite import choices, conf_folder
+    from plab.config.suite import choices, plab_folder
     from plab.config.task import *
 
 __all__ = [
@@ -33,10 +33,10 @@ __all__ = [
     "build_scene",
     "check_overrides",
     "choices",
-    "conf_folder",
     "drawn_configs",
     "finish",
     "load_config",
+    "plab_folder",
 ]
 
 

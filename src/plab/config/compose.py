@@ -30,7 +30,7 @@ from plab.config import ranges
 from plab.config.families import family
 from plab.config.overrides import RANDOM, explained, parse, prepared, quoted, variant_changes
 from plab.config.run import Config
-from plab.config.suite import choices, conf_folder
+from plab.config.suite import choices, plab_folder
 from plab.errors import ConfigError, located, suggest
 from plab.plugins import search_in
 from plab.scenes import MATERIAL_KEYS, Scene, vector3
@@ -148,7 +148,7 @@ def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = Non
 def hydra_app() -> Hydra:
     """Return a Hydra application for plab's files, independent of other applications."""
     version.setbase("1.3")
-    return Hydra("plab", ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_folder()))))
+    return Hydra("plab", ConfigLoaderImpl(config_search_path=create_config_search_path(str(plab_folder()))))
 
 
 def _sets_a_value(override: Override) -> bool:

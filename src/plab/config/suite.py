@@ -23,16 +23,16 @@ PAPER_SEEDS = ("0", "1", "2")
 """Seeds per configuration in the paper."""
 
 
-def conf_folder() -> Path:
-    """Return the folder of plab's YAML files: the source tree's ``conf/``, or ``plab/conf`` of a wheel."""
+def plab_folder(name: str = "conf") -> Path:
+    """Return a folder of plab's own files: ``plab/<name>`` of a wheel, or ``<name>`` of the source tree."""
     package = Path(__file__).resolve().parents[1]
-    installed = package / "conf"
-    return installed if installed.is_dir() else package.parents[1] / "conf"
+    installed = package / name
+    return installed if installed.is_dir() else package.parents[1] / name
 
 
 def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]:
     """Return the files of a group, such as ``task``, by name, sorted: plab's own files and the user's."""
-    folders = [conf_folder(), *([] if config_dir is None else [Path(config_dir).expanduser()])]
+    folders = [plab_folder(), *([] if config_dir is None else [Path(config_dir).expanduser()])]
     files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
     return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
 
@@ -43,7 +43,7 @@ def shipped_file(group: str, name: str) -> Mapping[str, Any]:
     # Imported here, because most commands do without it.
     from omegaconf import OmegaConf
 
-    path = conf_folder() / group / f"{name}.yaml"
+    path = plab_folder() / group / f"{name}.yaml"
     if not path.is_file():
         return {}
     own: Any = OmegaConf.load(path)

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from plab.config.suite import plab_folder
 from plab.progress import Report
 from plab.report.page import asset, render
 from plab.results import ResultsError
@@ -17,13 +18,6 @@ NOTEBOOKS = ("reproduction", "speed", "accuracy", "anatomy")
 """Names of the notebooks."""
 
 _PACKAGES = ("jupytext", "nbclient", "nbconvert", "nbformat", "ipykernel", "IPython")
-
-
-def notebook_folder() -> Path:
-    """Return the folder of the notebook sources: ``reports/`` of a wheel or of the source tree."""
-    package = Path(__file__).resolve().parents[1]
-    own = package / "reports"
-    return own if own.is_dir() else package.parents[1] / "reports"
 
 
 def execute(parameters: Mapping[str, Any], out: Path, report: Report) -> None:
@@ -65,7 +59,7 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
     from nbclient import NotebookClient
     from nbclient.exceptions import CellExecutionError
 
-    notebook = jupytext.read(notebook_folder() / f"{name}.py")
+    notebook = jupytext.read(plab_folder("reports") / f"{name}.py")
     at = next(k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
     given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
     notebook.cells.insert(at + 1, nbformat.v4.new_code_cell(f"# Given on the command line\n{given}"))

@@ -329,39 +329,30 @@ def overall_agreement(cells: pd.DataFrame) -> dict[str, float]:
 
 def solvability(runs: Runs) -> list[Table]:
     """Return the scores of the demonstrations next to those of the paper's best method."""
-    grid = itertools.product(ordered_tasks(runs.tasks), runs.variants)
-    paper = paper_table("iou_per_configuration")
-    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()]
-    names = {"method": "paper_method", "iou_mean": "paper_mean", "iou_std": "paper_std"}
-    data = pd.DataFrame(grid, columns=["task", "variant"]).merge(demonstration_scores(), "left")
-    data = data.merge(best.rename(columns=names), "left").fillna({"paper_method": ""})
-    columns = data[["score", "paper_mean", "paper_std"]].itertuples(index=False)
-    # A replay has no spread, so the interval is the paper's.
-    sides = [
-        (Summary(score, 0.0, 2 * (score == score)), Summary(mean, std, len(PAPER_SEEDS) * (mean == mean)))
-        for score, mean, std in columns
-    ]
-    gaps = [stratified_difference([ours], [theirs]) for ours, theirs in sides]
-    printed = [
-        f"{mean_and_std(theirs)} ({method(name).label})" if theirs.count else NOTHING
-        for (_, theirs), name in zip(sides, data["paper_method"], strict=True)
-    ]
-    cells = data[["task", "variant"]].assign(
-        **{
-            "demonstration": data["score"].map(number),
-            "paper, best method": printed,
-            "difference": [number(gap.value, sign=True) for gap in gaps],
-            INTERVAL: [format_interval(gap) for gap in gaps],
-        }
-    )
-    data[["difference", "low", "high"]] = [(gap.value, gap.low, gap.high) for gap in gaps]
+    ours, paper = demonstration_scores(), _paper_scores("iou_per_configuration")
+    scores = ours.set_index(["task", "variant"])["score"]
+    rows, cells = [], []
+    for place in itertools.product(ordered_tasks(runs.tasks), runs.variants):
+        score = scores.get(place, float("nan"))
+        rivals = {name: own for (*key, name), own in paper.items() if tuple(key) == place}
+        best = max(rivals, key=lambda name, own=rivals: own[name].mean, default="")
+        theirs = rivals.get(best, summarise([]))
+        # A replay has no spread, so the interval is the paper's.
+        gap = stratified_difference([Summary(score, 0.0, 2 * (score == score))], [theirs])
+        rows.append((*place, score, best, theirs.mean, theirs.std, gap.value, gap.low, gap.high))
+        printed = f"{mean_and_std(theirs)} ({method(best).label})" if best else NOTHING
+        cells.append((*place, number(score), printed, number(gap.value, sign=True), format_interval(gap)))
+    names = ["task", "variant", "score", *(f"paper_{name}" for name in ("method", "mean", "std"))]
+    data = pd.DataFrame(rows, columns=[*names, "difference", "low", "high"])
+    heads = ["task", "variant", "demonstration", "paper, best method", "difference", INTERVAL]
     notes = [
         "Normalised incremental IoU of the best known actions, replayed in the hard contact model.",
         "Our targets are generated from parameters or scripts, the paper's are files, so the goals of "
         "the two columns differ slightly. The interval is Student's t over the paper's seeds.",
     ]
     title = "Demonstrations and the best method of the paper"
-    return [Table("solvability", "comparison", title, cells, data, None, notes, True)]
+    shown = pd.DataFrame(cells, columns=heads)
+    return [Table("solvability", "comparison", title, shown, data, None, notes, True)]
 
 
 def demonstration_scores() -> pd.DataFrame:
@@ -433,10 +424,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
             measured.append((task, kind, f"runs, {device}", ms, theirs))
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
             where = f"benchmark, {row['device']}, {row['precision']}, batch {row['batch']}"
-            for column, kind, name in (
-                ("forward_ms", "forward", "forward_ms"),
-                ("gradient_ms", _GRADIENT, "forward_backward_ms"),
-            ):
+            for kind, column, name in _BENCHMARK:
                 measured.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
     data, cells = [], []
     for task, kind, where, mine, theirs in measured:
@@ -455,6 +443,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
 
 
 _GRADIENT = "forward + backward"
+_BENCHMARK = ("forward", "forward_ms", "forward_ms"), (_GRADIENT, "gradient_ms", "forward_backward_ms")
 
 
 def _step_times(runs: Runs) -> pd.DataFrame:

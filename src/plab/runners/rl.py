@@ -31,11 +31,6 @@ if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch, Transition
 
 
-def agents_of(method: RlConfig) -> type[Agents]:
-    """Return the agents of a method's algorithm."""
-    return family(method.family).rules[method.algorithm].what
-
-
 class RlRunner(PolicyRunner):
     """Runner of a population of agents in lockstep, and of their environments.
 
@@ -53,7 +48,7 @@ class RlRunner(PolicyRunner):
         from plab.envs.tensors import TensorEnv
 
         cfgs, method = [track.cfg for track in self.tracks], self.method
-        kind = agents_of(method)
+        kind: type[Agents] = family(method.family).rules[method.algorithm].what
         self.set_cycle(batch, kind.cycle_steps(method, batch.horizon))
         self._env, self._envs = TensorEnv(batch), method.num_envs
         self._device, cuda = torch.device(method.torch_device), method.torch_device == "cuda"
