@@ -164,9 +164,11 @@ def test_goals_agree_with_hindsight() -> None:
     # The goal is where the target is, in every episode.
     center = env.unwrapped.batch.configs[0].task.target["bodies"]["ball"]["center"]
     for options in ({"target.bodies.ball.center": [0.45, 0.4, 0.5]}, {"target.bodies.ball.center": center}):
-        env.reset(options=options)
+        goal = env.reset(options=options)[0]["desired_goal"]
         points = env.env.reset(options=options)[0]["target_points"]
         np.testing.assert_allclose(points.mean(axis=0), options["target.bodies.ball.center"], atol=0.02)
+        means = np.tensordot(goal, (np.indices(goal.shape) + 0.5) / len(goal), ((0, 1, 2), (1, 2, 3)))
+        np.testing.assert_allclose(means, options["target.bodies.ball.center"], atol=0.006)
     env.close()
 
 

@@ -280,9 +280,10 @@ def _unit(*shape: int) -> Box:
 
 def coarse_shares(mass: np.ndarray) -> np.ndarray:
     """Return the fraction of a mass tensor, shape [n, n, n], in each of :data:`CELLS` cells per axis."""
-    first = np.ceil(np.arange(CELLS) * len(mass) / CELLS).astype(int)
+    # The mass of a node belongs in halves to both of its sides.
+    first = np.ceil(2 * np.arange(CELLS) * len(mass) / CELLS).astype(int) + (np.arange(CELLS) > 0)
     for axis in range(3):
-        mass = np.add.reduceat(mass, first, axis=axis)
+        mass = np.add.reduceat(mass.repeat(2, axis), first, axis=axis)
     return mass / mass.sum()
 
 
