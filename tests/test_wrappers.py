@@ -105,7 +105,7 @@ def test_a_diverged_environment_is_truncated_and_the_others_go_on(vector, alone)
 
 def test_success_ends_an_episode_if_asked_to(alone) -> None:
     options = {"success_score": 0.0, "terminate_on_success": True, "earth_movers": True}
-    env = plab.make_vec("Move", num_envs=2, overrides=COARSE, **options)
+    env = plab.make_vec("Move", num_envs=2, overrides=COARSE_32, max_episode_steps=HORIZON, **options)
     assert np.isnan(env.reset()[1]["earth_movers"]).all()
     _, _, terminated, truncated, info = env.step(np.zeros((2, 6)))
     assert terminated.all() and not truncated.any() and info["success"].all()

@@ -65,10 +65,13 @@ def make_batch(task: str, variant: str, **options: Any) -> EpisodeBatch:
     Args:
         task: Name of the task.
         variant: Name of the variant.
-        **options: Other arguments of :func:`compose_configs`, and keyword arguments of :class:`EpisodeBatch`.
+        **options: Other arguments of :func:`compose_configs`, keyword arguments of :class:`EpisodeBatch`, and
+            ``max_episode_steps``, Gymnasium's name of ``sim.horizon``.
 
     Errors are those of :func:`compose_configs` and :class:`EpisodeBatch`.
     """
+    if (steps := options.pop("max_episode_steps", None)) is not None:
+        options["overrides"] = [*options.get("overrides", ()), f"sim.horizon={steps}"]
     names = ("num_envs", "overrides", "overrides_per_env", "config_dir")
     own = {name: options.pop(name) for name in names if name in options}
     return EpisodeBatch(compose_configs(task, variant, **own), **{"stages": True} | options)

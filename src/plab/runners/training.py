@@ -90,13 +90,8 @@ def evaluate(
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) -> list[EpisodeBatch]:
     """Return batches of environments in their initial states, each for some configurations and a contact
     model, reused from the last run if compatible."""
-
     # Imported here, because it imports the simulator.
     from plab.envs.core import EpisodeBatch
-
-    def start_again(batches: list[EpisodeBatch]) -> None:
-        for batch, (cfgs, _) in zip(batches, kinds, strict=True):
-            batch.renew(cfgs)
 
     key: list[Hashable] = []
     for cfgs, contact in kinds:
@@ -106,7 +101,7 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) 
     return cache.get(
         tuple(key),
         lambda: [EpisodeBatch(cfgs, contact=contact) for cfgs, contact in kinds],
-        check=start_again,
+        check=lambda batches: [batch.renew(own) for batch, (own, _) in zip(batches, kinds, strict=True)],
     )
 
 
