@@ -335,8 +335,7 @@ def solvability(runs: Runs) -> list[Table]:
     for place in itertools.product(ordered_tasks(runs.tasks), runs.variants):
         score = scores.get(place, float("nan"))
         rivals = {name: own for (*key, name), own in paper.items() if tuple(key) == place}
-        best = max(rivals, key=lambda name, own=rivals: own[name].mean, default="")
-        theirs = rivals.get(best, summarise([]))
+        best, theirs = max(rivals.items(), key=lambda pair: pair[1].mean, default=("", summarise([])))
         # A replay has no spread, so the interval is the paper's.
         gap = stratified_difference([Summary(score, 0.0, 2 * (score == score))], [theirs])
         rows.append((*place, score, best, theirs.mean, theirs.std, gap.value, gap.low, gap.high))
