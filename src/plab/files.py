@@ -197,22 +197,21 @@ def array_in(file: BinaryIO) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------------- shapes
 
 
-def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
-    """Find a shape file, and return its path and the SHA-256 of its content.
+def find_file(file: str, *, by_name: bool) -> Path:
+    """Return the path of a user's file.
 
     Args:
         file: The file. A relative path is searched for in the working directory, then in the config folder
-            and its parent folder. A missing absolute path is searched for by file name in the same places if
-            its SHA-256 is known.
-        sha256: Expected SHA-256 of the content; None for any content.
+            and its parent folder.
+        by_name: Whether to search for a missing absolute path by file name in the same places.
 
     Raises:
-        ShapeError: If the file is missing, unreadable, or has another checksum.
+        ShapeError: If the file is missing.
     """
-    path = Path(file)
+    path = Path(file).expanduser()
     folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
     places = [path] if path.is_absolute() else [folder / path for folder in folders]
-    if path.is_absolute() and sha256 is not None:
+    if path.is_absolute() and by_name:
         places += [folder / path.name for folder in folders]
     found = next((place for place in places if os.path.exists(place)), None)
     if found is None:
@@ -221,7 +220,13 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
             "parent folder"
         )
     # Not resolved, because the target of a link may have another suffix.
-    path = found.absolute()
+    return found.absolute()
+
+
+def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
+    """Find a shape file, see :func:`find_file`, and return its path and the SHA-256 of its content; raise
+    ShapeError if the file is missing, unreadable, or has another checksum than ``sha256``, if given."""
+    path = find_file(file, by_name=sha256 is not None)
     try:
         if regular_file(path).st_size > _LARGEST_SHAPE:
             raise ValueError(f"it has more than {_LARGEST_SHAPE / 1e6:.0f} MB")

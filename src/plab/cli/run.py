@@ -79,7 +79,9 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     # Folders for launcher logs; other keys may belong to a method or task other than the default.
     own += [one for key, one in by_key if key == "results_dir" and not one.is_sweep_override()]
     master = compose_with_hydra([str(one.input_line) for one in own], options.config_dir)
-    if options.multirun or str(master.hydra.mode).endswith("MULTIRUN"):
+    mode, values = str(master.hydra.mode), master.hydra.sweeper.params
+    # An experiment with values is a sweep, unless hydra.mode says otherwise.
+    if options.multirun or mode.endswith("MULTIRUN") or (mode == "None" and values):
         return master
     if idle := [word for word in words if re.match(r"[+]*hydra[./](launcher|sweep)", word)]:
         raise ConfigError(f"'{idle[0]}' has no effect on a single run: add -m, or omit it")

@@ -70,7 +70,7 @@ class Family:
         rules: Choices of ``method.algorithm`` or ``method.optimizer``, if any.
         contact: Contact model of the rows, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
-        methods: Appearance of methods by name; others are shown in grey.
+        methods: Appearance of plab's methods by name; reports choose that of others.
     """
 
     config: type

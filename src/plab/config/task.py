@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -169,16 +168,14 @@ class KinematicsConfig(ranges.Section):
 
     def pin(self) -> None:
         """Replace the model's name by its path, unless it is in a package, and add its SHA-256."""
-        from plab.kinematics import locate_model
-
         with located("task.kinematics"):
-            self.model = locate_model(self.model)
             self._read()
 
     def _read(self) -> Chain:
-        # Imported here, as above: few tasks have an articulated model.
-        from plab.kinematics import ModelError, read_model
+        # Imported here, because few tasks have an articulated model.
+        from plab.kinematics import ModelError, locate_model, read_model
 
+        self.model = locate_model(self.model, by_name=self.sha256 is not None)
         chain, digest = read_model(self.model, self.root, self.size, self.omit)
         if self.sha256 not in (None, digest):
             raise ModelError(
@@ -339,4 +336,4 @@ def _pin(node: Any, path: str) -> None:
         _pin(value, f"{path}.{key}")
     if isinstance(node.get("file"), str):
         with located(path):
-            node["file"], node["sha256"] = pinned(os.path.expanduser(node["file"]), node.get("sha256"))
+            node["file"], node["sha256"] = pinned(node["file"], node.get("sha256"))

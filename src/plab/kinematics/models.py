@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plab.files import pinned
+from plab.files import find_file
 from plab.kinematics.chain import Chain, Joint, Link, ModelError, matched, pose_matrix
 
 CAPSULE_RATIO = 1.5
@@ -55,10 +55,10 @@ def read_model(
     return chain, hashlib.sha256(repr(chain).encode()).hexdigest()
 
 
-def locate_model(model: str) -> str:
-    """Return the path of a model file, see :func:`plab.files.pinned`, unless it is in a package."""
+def locate_model(model: str, *, by_name: bool) -> str:
+    """Return the path of a model file, see :func:`plab.files.find_file`, unless it is in a package."""
     inside_package = ":" in model and not os.path.exists(model)
-    return model if inside_package else pinned(os.path.expanduser(model))[0]
+    return model if inside_package else str(find_file(model, by_name=by_name))
 
 
 @functools.lru_cache(maxsize=32)

@@ -84,7 +84,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     Args:
         source: Folder of results, archive, or several of them.
         chosen: Selection of runs; defaults: the suite's tasks, or those of the results if it has none of
-            them; the suite's variants; the methods and seeds of the paper and of the results.
+            them; the suite's variants, or those of the results for tasks that are not plab's; the methods and
+            seeds of the paper and of the results.
         split: Setting whose values are treated as separate methods: a dotted key, ``folder`` or ``seed``;
             empty: none.
 
@@ -98,15 +99,22 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     suite, own = suite_tasks(), sorted({row.values["task"] for row in fitting})
+    tasks = chosen.choices.get("task", suite if not own or set(own) & set(suite) else own)
+    variants = sorted({str(row.values["variant"]) for row in fitting if row.values["task"] in tasks})
+    if not variants or set(tasks) & set(choices("task")):
+        variants = list(SUITE_VARIANTS)
     free = {
-        "task": suite if not own or set(own) & set(suite) else own,
-        "variant": list(SUITE_VARIANTS),
+        "task": tasks,
+        "variant": variants,
         "method": ordered(row.values["method"] for row in fitting),
         "seed": sorted({str(row.values["seed"]) for row in fitting} | set(PAPER_SEEDS), key=int),
     }
     asked = {name: chosen.choices.get(name, free[name]) for name in NAMES}
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
+    ended = [row for row in fitting if row.values["status"] == "finished"]
+    others = {name: sorted({str(row.values[name]) for row in ended} - set(asked[name])) for name in NAMES}
+    advice = " ".join(f"{name}={','.join(texts[:9])}" for name, texts in others.items() if texts)
     methods, seeds = asked["method"], asked["seed"]
     if split:
         complete, new = _split(complete, split, sources_of(source))
@@ -121,9 +129,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     columns = None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
     counts = {
         "left out: not finished": len(inside) - len(complete),
-        "left out: other tasks, variants, methods or seeds": (
-            sum(row.values["status"] == "finished" for row in fitting) - len(complete)
-        ),
+        f"left out: request them by {advice}": len(ended) - len(complete),
         "left out: more settings that differ from conf/": len(complete) - len(finished),
     }
     left_out = [f"{count} run(s) {what}" for what, count in counts.items() if count]
@@ -237,8 +243,9 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     variants = config["task"].get("variants") or {}
     by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
-    own = {key: lookup(config, key) for key in expected if key not in by_variant}
-    # None where the run has no such setting.
+    keys = [*expected, *(key for key, _ in leaves({"method": config["method"]}) if "method.name" in expected)]
+    # None where the run or plab's file has no such setting.
+    own = {key: lookup(config, key) for key in keys if key not in by_variant and key not in _IGNORED_KEYS}
     own = {key: None if value != value else value for key, value in own.items()}
     own |= {key: value for key, value in leaves(config["task"].get("randomize"), "task.randomize") if value}
     return {key: value for key, value in own.items() if value != expected.get(key)}

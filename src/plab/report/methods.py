@@ -35,10 +35,11 @@ _STYLES = {
     for family in FAMILIES.values()
     for name, look in family.methods.items()
 }
+_NAMES = tuple(_STYLES)
 
 
 def method(name: str) -> Method:
-    """Return the appearance of a method; unknown methods are grey and have no kind."""
+    """Return the appearance of a method; methods unknown to :func:`ordered` are grey and have no kind."""
     return _STYLES.get(name) or Method(name, "#777777", ":", name)
 
 
@@ -67,7 +68,11 @@ def part(name: str, key: str, value: str, place: int) -> str:
 
 
 def ordered(present: Iterable[str]) -> list[str]:
-    """Return the paper's methods, then the other methods present, in the order of tables and legends."""
+    """Return the paper's methods, then the other methods present, in the order of tables and legends. Methods
+    that are not plab's get dotted lines of different colours."""
     others = set(present) - set(PAPER_METHODS)
-    known = [name for name in _STYLES if name in others]
-    return [*PAPER_METHODS, *known, *sorted(others - set(known))]
+    known = [name for name in _NAMES if name in others]
+    own = sorted(others - set(known))
+    for place, name in enumerate(own):
+        _STYLES[name] = Method(name, _PALETTE[place % len(_PALETTE)], ":", name)
+    return [*PAPER_METHODS, *known, *own]

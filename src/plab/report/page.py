@@ -21,7 +21,8 @@ from typing import Any
 import pandas as pd
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from plab.config.suite import choices
+from plab.config.selection import leaves, lookup
+from plab.config.suite import shipped_file
 from plab.report.collect import Runs, changed_settings
 from plab.report.methods import Method, method
 from plab.report.statistics import AXES, Rows, Series, band, load_series
@@ -175,29 +176,37 @@ def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _command(config: Mapping[str, Any]) -> str:
     """Return the command that repeats a run."""
-    drawn = config.get("seed_scene")
+    drawn, method = config.get("seed_scene"), config["method"]
     variant = config["variant"] if drawn is None else f"random seed_scene={drawn}"
-    method, files = config["method"], choices("method")
     # An experiment may rename the method of a file.
-    file = next((n for n in (method["name"], method.get("algorithm")) if n in files), method["name"])
-    changed = changed_settings({**config, "method": {**method, "name": file}})
+    names = [name for name in (method["name"], method.get("algorithm")) if shipped_file("method", str(name))]
+    file = names[0] if names else method["name"]
     words = [f"task={config['task']['name']}", *f"variant={variant}".split()]
     words += [f"method={file}", f"seed={config['seed']}"]
-    own = {"method.name": method["name"], "protocol": config["protocol"]["name"]}
-    own["sim.device"] = config["sim"]["device"]
-    usual = {"method.name": file, "protocol": "plab", "sim.device": "cpu"}
-    words += [f"{key}={value}" for key, value in own.items() if value != usual[key]]
+    chosen = {"method.name": (method["name"], file), "protocol": (config["protocol"]["name"], "plab")}
+    chosen["sim.device"] = config["sim"]["device"], "cpu"
+    words += [f"{key}={value}" for key, (value, default) in chosen.items() if value != default]
+    changed, usual = changed_settings({**config, "method": {**method, "name": file}}), shipped_file("method", file)
     if "method.planner.name" in changed:
         # Another planner has other keys.
         words.append(f"method@method.planner={changed['method.planner.name']}")
         changed = {key: value for key, value in changed.items() if not key.startswith("method.planner.")}
         of_planner = changed_settings({**config, "method": method["planner"]})
         changed |= {key.replace("method", "method.planner"): value for key, value in of_planner.items()}
+    if not usual:
+        own = leaves({"method": method})
+        changed |= {key: value for key, value in own if value != {} and key[7:] not in ("name", "family")}
     for key, value in changed.items():
         text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-        # Only the keys of this section may be missing.
-        sign = "++" if key.startswith("task.randomize.") else ""
-        words.append(f"{sign}{key}={text.replace('Infinity', '.inf')}")
+        known = lookup({"method": usual}, key)
+        plus = "+" * (key.startswith("method.loss_") and bool(usual) and known != known)
+        # All or some keys of this section may be missing.
+        plus = "++" if key.startswith("task.randomize.") else plus
+        words.append(f"{plus}{key}={text.replace('Infinity', '.inf')}")
+    external = any(":" in str(value) for value in [method["family"], *changed.values()])
+    if external or not shipped_file("task", config["task"]["name"]):
+        # The folder of the user's files, which results do not record.
+        words += ["--config-dir", "FOLDER"]
     return shlex.join(["plab", "run", *words])
 
 
