@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from types import MappingProxyType
 
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that enables tracebacks of bugs."""
@@ -17,9 +18,11 @@ class PlabError(Exception):
 
     Attributes:
         exit_code: Exit code of a command that raises it.
+        by_kind: Errors of single configurations, by :func:`plab.problem.kinds_of`, if several were built.
     """
 
     exit_code = 2
+    by_kind: Mapping[str, PlabError] = MappingProxyType({})
 
     def __str__(self) -> str:
         """Return the message, shortened if it contains a very long quote."""

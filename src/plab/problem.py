@@ -178,9 +178,21 @@ class Problem:
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
-        self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
+        try:
+            self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
+        except SimulationError as error:
+            error.by_kind = {kinds[e]: SimulationError(why) for e, why in error.failures.items()}
+            raise
         # Distances are computed once for equal targets.
-        distances = {kind: target_distance(self.target_mass[k]) for kind, k in first.items()}
+        distances, errors = dict[str, np.ndarray](), dict[str, TargetError]()
+        for kind, k in first.items():
+            try:
+                distances[kind] = target_distance(self.target_mass[k])
+            except TargetError as error:
+                errors[kind] = error
+        for error in errors.values():
+            error.by_kind = errors
+            raise error
         self._distances: list[np.ndarray] | None = [distances[kind] for kind in kinds]
         self.simulator.set_target(self.target_mass, np.stack(self._distances))
         self.target_mass = self.simulator.target_mass

@@ -84,12 +84,14 @@ def leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 def _same(value: Any, text: str) -> bool:
     """Return whether a configuration's value equals a string: numbers by value, lists by their entries,
-    others literally."""
+    others literally; a missing key has the value null."""
+    if value is None or value != value:
+        return text.lower() in ("null", "none")
     if isinstance(value, list):
         parts = text.strip("[] ").split(",")
         return str(value) == text or (len(parts) == len(value) and all(map(_same, value, parts)))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value).lower() == text.strip().lower() or (value is None and text == "null")
+        return str(value).lower() == text.strip().lower()
     try:
         return float(text) == value
     except ValueError:

@@ -74,5 +74,5 @@ def ordered(present: Iterable[str]) -> list[str]:
     known = [name for name in _NAMES if name in others]
     own = sorted(others - set(known))
     for place, name in enumerate(own):
-        _STYLES[name] = Method(name, _PALETTE[place % len(_PALETTE)], ":", name)
+        _STYLES[name] = Method(name, _PALETTE[-1 - place % len(_PALETTE)], ":", name)
     return [*PAPER_METHODS, *known, *own]

@@ -383,6 +383,7 @@ class Runner:
                         self.build()
                 except Exception as error:
                     if len(self.tracks) > 1 and not isinstance(error.__cause__, DeviceError):
+                        self._fail_by_kind(error)
                         raise TogetherError(str(error)) from error
                     raise
                 for track in self.tracks:
@@ -392,6 +393,9 @@ class Runner:
                 with self._progress("", *self.extent()) as self.report:
                     while active := [track for track in self.tracks if track.open and self.has_more(track)]:
                         self.enter(phase, active)
+                        for track in active:
+                            # For estimates of the remaining time.
+                            track.run.result.provenance["active"] = len(active)
                         phase, start, rows = "optimise", time.perf_counter(), dict[Track, dict[str, float]]()
                         with simulation_errors(f"iteration {active[0].iteration}: "):
                             steps = dict(self.iterate(active))
@@ -417,6 +421,16 @@ class Runner:
         cfgs = [track.cfg for track in self.tracks]
         options: dict[str, Any] = {"enabled": cfgs[0].progress, "compiling": watch_compiling}
         return show_progress(f"{self._note}{title(*cfgs)}{what}", done, total, plain_every=every, **options)
+
+    def _fail_by_kind(self, error: Exception) -> None:
+        """Mark the runs as failed whose configurations caused an error in :meth:`build`, if that is known."""
+        from plab.problem import kinds_of
+        from plab.sim import SimulationError
+
+        known = [one.by_kind for one in (error, error.__cause__) if isinstance(one, PlabError)]
+        for track, kind in zip(self.tracks, kinds_of([track.cfg for track in self.tracks]), strict=True):
+            for own in (errors[kind] for errors in known if kind in errors):
+                track.fail(RunError(str(own)) if isinstance(own, SimulationError) else own)
 
     def _start(self, track: Track) -> None:
         """Start a run, or resume it from its file; reject a state that does not fit this run."""

@@ -40,7 +40,7 @@ class Survey:
             ``message``, the reason for a failure; ``score``, of the best row so far if the run has not
             finished; ``done`` and ``total``, iterations or episodes (0 if unknown); ``rate``, their number
             per second; ``seconds``, wall time so far; ``left``, remaining time [s] or its share of a batch;
-            ``together``, number of runs in the process; ``path``. Unknown numbers are NaN.
+            ``together``, number of runs that share the process; ``path``. Unknown numbers are NaN.
         others: Number of other runs in the results, which were not requested or have other settings.
         unreadable: Messages about files that could not be read.
         protocol: Name of the runs' protocol.
@@ -71,8 +71,9 @@ class Survey:
 
     @property
     def workers(self) -> int:
-        """Number of active processes; the runs of a batch share one."""
-        return max(round((1.0 / self.running["together"]).sum()), 1) if len(self.running) else 0
+        """Number of active processes; the runs of a batch share one, those that wait do not count."""
+        active = self.running[self.running["left"] != 0.0]
+        return max(round((1.0 / active["together"]).sum()), 1) if len(self.running) else 0
 
     @property
     def eta(self) -> float | None:
@@ -160,7 +161,9 @@ def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, A
     except ResultsError:
         # It may just have ended and removed its partial file.
         return {}
-    together = summary["provenance"].get("batch", 1)
+    origin = summary["provenance"]
+    # The runs of a batch that still iterate.
+    together = origin.get("active", origin.get("batch", 1))
     known = {"seconds": float(sum(summary["wall_time"].values())), "together": together}
     count = len(table.get("seconds", ()))
     if not count:
