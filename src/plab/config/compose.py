@@ -216,6 +216,9 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     ConfigError if the task is not an unmodified task of the suite, or has no ``random`` section."""
     from plab.config.randomization import with_own_materials
 
+    if cfg.task.name not in choices("task"):
+        raise ConfigError(f"{cfg.task.name} is a task of your own: random scenes in a run need one of plab's")
+
     def drawing(variant: str, seed_scene: int | None) -> Config:
         seed = [] if seed_scene is None else [f"seed_scene={int(seed_scene)}"]
         one = load_config([f"task={cfg.task.name}", f"variant={variant}", *seed])

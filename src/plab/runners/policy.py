@@ -202,7 +202,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         raise ResultsError(f"{result} is not a result file: name the run's {SUFFIX} file")
     path = policy_path(Path(result))
     if not path.exists():
-        why = "sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
+        why = "sac, td3, ppo, shac, pods and bc write it when a run ends, and archives do not contain it"
         raise ResultsError(f"{path} does not exist: {why}")
     with explained(path):
         policy = _policy(path)
