@@ -224,15 +224,17 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
         so that it starts at 1.
     """
     names = runs.table[["task", "variant", "method", "seed"]].astype(str).to_dict("records")
-    found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]))
+    found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]), runs.table["best_iteration"])
     return list(zip(names, found, strict=True))
 
 
-def rows_on_axes(config: Mapping[str, Any], rows: Rows) -> Rows:
+def rows_on_axes(config: Mapping[str, Any], rows: Rows, best_iteration: int) -> Rows:
     """Return the iterations of a loaded run, with the columns of :func:`load_series`."""
     sim, known = config["sim"], known_family(config["method"]["family"])
     simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
-    if known is not None and known.ranking == "score":
+    # An external family may be unknown; if its best row has not the lowest loss, it ranks by score.
+    by_score = known is None and rows["loss"][best_iteration] > rows["loss"].min()
+    if by_score or (known is not None and known.ranking == "score"):
         best = np.maximum.accumulate(rows["score"])
     else:
         # Row of the lowest loss so far.

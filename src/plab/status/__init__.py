@@ -174,8 +174,9 @@ def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, A
     known |= {"done": min(int(done[-1]), total or count), "score": float(table["score"][best])}
     if "kept_score" in table and table["kept_score"][-1] >= 0.0:
         known["score"] = float(table["kept_score"][-1])
-    if row.config["method"]["family"] == "planner" and known["score"] >= SOLVED:
-        # It waits for the other runs of its batch.
+    family = row.config["method"]["family"]
+    if by_rows and (family == "planner" or ":" in family) and known["score"] >= SOLVED:
+        # A planner, which may be external, waits for the other runs of its batch.
         return known | {"done": total, "left": 0.0}
     # The first row of a process compiles the kernels.
     recent = min(_RECENT_ROWS, count - 1)

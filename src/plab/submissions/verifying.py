@@ -435,8 +435,8 @@ def _of_run(row: Row) -> Entry:
     """Return the best actions of a run."""
     cfg, actions = rollouts.stored(row.path)
     score = row.values["score_best"]
-    (columns,) = read_curves([row.path])
-    steps = int(rows_on_axes(row.config, columns)["simulated"][row.values["best_iteration"]])
+    (columns,), best = read_curves([row.path]), row.values["best_iteration"]
+    steps = int(rows_on_axes(row.config, columns, best)["simulated"][best])
     return Entry(configuration_of(cfg), checksum(cfg), steps, score, actions)
 
 
