@@ -59,7 +59,7 @@ def test_all_configurations_step_score_and_differentiate(task, device):
 @pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_targets_are_those_that_were_published(task, device):
-    """Compare with ``tests/target_moments.csv``, written by ``python -m plab.targets --csv``.
+    """Compare with ``tests/target_moments.csv``, written by ``plab targets --csv``.
 
     The tolerance covers the differences between float32 and float64, CPU and CUDA, with a margin.
     """

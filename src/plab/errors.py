@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from types import MappingProxyType
 
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that enables tracebacks of bugs."""
@@ -22,7 +21,7 @@ class PlabError(Exception):
     """
 
     exit_code = 2
-    by_kind: Mapping[str, PlabError] = MappingProxyType({})
+    by_kind: Mapping[str, PlabError] | None = None
 
     def __str__(self) -> str:
         """Return the message, shortened if it contains a very long quote."""

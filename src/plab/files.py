@@ -198,16 +198,9 @@ def array_in(file: BinaryIO) -> np.ndarray:
 
 
 def find_file(file: str, *, by_name: bool) -> Path:
-    """Return the path of a user's file.
-
-    Args:
-        file: The file. A relative path is searched for in the working directory, then in the config folder
-            and its parent folder.
-        by_name: Whether to search for a missing absolute path by file name in the same places.
-
-    Raises:
-        ShapeError: If the file is missing.
-    """
+    """Return the path of a user's file; raise ShapeError if it is missing. A relative path is searched for in
+    the working directory, then in the config folder and its parent folder; a missing absolute path likewise
+    by its file name, if ``by_name``."""
     path = Path(file).expanduser()
     folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
     places = [path] if path.is_absolute() else [folder / path for folder in folders]

@@ -159,31 +159,23 @@ class KinematicsConfig(ranges.Section):
             raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
     def build(self) -> Chain:
-        """Return the scene's articulated model; raise ConfigError if the model cannot be read or has changed,
-        or a pattern matches nothing."""
-        patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
-        with located("task.kinematics"):
-            chain = self._read().placed(self.position, self.rotation, self.free, **patterns)
-        return chain
-
-    def pin(self) -> None:
-        """Replace the model's name by its path, unless it is in a package, and add its SHA-256."""
-        with located("task.kinematics"):
-            self._read()
-
-    def _read(self) -> Chain:
+        """Return the scene's articulated model, replace the model's name by its path, unless it is in a
+        package, and add its SHA-256; raise ConfigError if the model cannot be read or has changed, or a
+        pattern matches nothing."""
         # Imported here, because few tasks have an articulated model.
         from plab.kinematics import ModelError, locate_model, read_model
 
-        self.model = locate_model(self.model, by_name=self.sha256 is not None)
-        chain, digest = read_model(self.model, self.root, self.size, self.omit)
-        if self.sha256 not in (None, digest):
-            raise ModelError(
-                f"{self.model} differs from the model of this configuration: its SHA-256 begins with "
-                f"{digest[:8]}, not with {str(self.sha256)[:8]!r}"
-            )
-        self.sha256 = digest
-        return chain
+        patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
+        with located("task.kinematics"):
+            self.model = locate_model(self.model, by_name=self.sha256 is not None)
+            chain, digest = read_model(self.model, self.root, self.size, self.omit)
+            if self.sha256 not in (None, digest):
+                raise ModelError(
+                    f"{self.model} differs from the model of this configuration: its SHA-256 begins with "
+                    f"{digest[:8]}, not with {str(self.sha256)[:8]!r}"
+                )
+            self.sha256 = digest
+            return chain.placed(self.position, self.rotation, self.free, **patterns)
 
 
 @dataclass
@@ -323,7 +315,7 @@ class TaskConfig(ranges.Section):
         """Replace the name of each file by its path, and add the SHA-256 of its content; ConfigError names
         the key of a file that is missing, unreadable or of another kind."""
         if self.kinematics is not None:
-            self.kinematics.pin()
+            self.kinematics.build()
         # The file of a variant has its own hash, independent of the task's.
         bodies = {name: vars(body) for name, body in self.bodies.items()}
         _pin({"bodies": bodies, "target": self.target, "variants": self.variants}, "task")

@@ -425,12 +425,11 @@ class Runner:
     def _fail_by_kind(self, error: Exception) -> None:
         """Mark the runs as failed whose configurations caused an error in :meth:`build`, if that is known."""
         from plab.problem import kinds_of
-        from plab.sim import SimulationError
 
-        known = [one.by_kind for one in (error, error.__cause__) if isinstance(one, PlabError)]
+        known = [one.by_kind or {} for one in (error, error.__cause__) if isinstance(one, PlabError)]
         for track, kind in zip(self.tracks, kinds_of([track.cfg for track in self.tracks]), strict=True):
             for own in (errors[kind] for errors in known if kind in errors):
-                track.fail(RunError(str(own)) if isinstance(own, SimulationError) else own)
+                track.fail(RunError(str(own)) if isinstance(own, RuntimeError) else own)
 
     def _start(self, track: Track) -> None:
         """Start a run, or resume it from its file; reject a state that does not fit this run."""

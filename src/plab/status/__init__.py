@@ -161,9 +161,8 @@ def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, A
     except ResultsError:
         # It may just have ended and removed its partial file.
         return {}
-    origin = summary["provenance"]
     # The runs of a batch that still iterate.
-    together = origin.get("active", origin.get("batch", 1))
+    together = summary["provenance"].get("active", 1)
     known = {"seconds": float(sum(summary["wall_time"].values())), "together": together}
     count = len(table.get("seconds", ()))
     if not count:
