@@ -25,30 +25,19 @@ def simulator_of(
     terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0}, {"contact": contact})
     kinetic = Kinetic()
     kinetic.name, kinetic.weight = "kinetic", 3.0
-    simulator = Simulator(
-        [SCENES[k] for k in scenes],
-        terms=(*terms, kinetic),
-        precision=precision,
-        device=device,
-        full_gradient=True,
-        deterministic=deterministic,
-    )
+    options = {"precision": precision, "device": device, "deterministic": deterministic}
+    own = [SCENES[k] for k in scenes]
+    simulator = Simulator(own, terms=(*terms, kinetic), full_gradient=True, **options)
     rest, n = simulator.state(), SCENES[0].grid_size
     particles = rest.x.shape[1]
     drawn = [np.random.default_rng(100 + k) for k in scenes]
-    simulator.set_target(
-        np.stack([0.3 * SCENES[0].particle_mass * rng.random((n, n, n)) for rng in drawn]),
-        np.stack([rng.random((n, n, n)) for rng in drawn]),
-    )
+    masses = [0.3 * SCENES[0].particle_mass * rng.random((n, n, n)) for rng in drawn]
+    simulator.set_target(np.stack(masses), np.stack([rng.random((n, n, n)) for rng in drawn]))
     strain = np.where(np.arange(particles) % 17 == 0, 0.3, 0.02)[:, None, None]
-    start = State(
-        rest.x,
-        np.stack([rng.normal(scale=1.0, size=(particles, 3)) for rng in drawn]),
-        np.stack([rng.normal(scale=20.0, size=(particles, 3, 3)) for rng in drawn]),
-        np.stack([np.eye(3) + strain * rng.normal(size=(particles, 3, 3)) for rng in drawn]),
-        rest.poses,
-    )
-    simulator.set_initial_state(start)
+    v = np.stack([rng.normal(scale=1.0, size=(particles, 3)) for rng in drawn])
+    C = np.stack([rng.normal(scale=20.0, size=(particles, 3, 3)) for rng in drawn])
+    F = np.stack([np.eye(3) + strain * rng.normal(size=(particles, 3, 3)) for rng in drawn])
+    simulator.set_initial_state(State(rest.x, v, C, F, rest.poses))
     return simulator
 
 

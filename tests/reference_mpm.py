@@ -213,12 +213,8 @@ def _viscoplastic(
     return _returned(G, U, k, d, mu, (lam + 2.0 * mu / 3.0) * trace)
 
 
-LAWS = {
-    "elastic": _elastic,
-    "fluid": _fluid,
-    "drucker_prager": _drucker_prager,
-    "viscoplastic": _viscoplastic,
-}
+LAWS = {"elastic": _elastic, "fluid": _fluid}
+LAWS |= {"drucker_prager": _drucker_prager, "viscoplastic": _viscoplastic}
 
 
 def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:
@@ -403,14 +399,11 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of the quaternions a and b, both w, x, y, z, shape [4]."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return torch.stack([w, x, y, z])
 
 
 def rotation_quaternion(rotvec: Tensor) -> Tensor:

@@ -70,8 +70,9 @@ def test_sweeps_over_groups_with_keys_that_the_default_has_not(seen):
     assert [cfg.method.episodes for cfg in seen[:2]] == [2, 2] and seen[4].method.tau == 0.01
 
 
-def test_an_experiment_is_a_sweep(seen):
-    assert main(["+experiment=yield_ablation", "method.episodes=7"]) == 0
+@pytest.mark.parametrize("mode", ["MULTIRUN", "null"])
+def test_an_experiment_is_a_sweep(seen, mode):
+    assert main(["+experiment=yield_ablation", "method.episodes=7", f"hydra.mode={mode}"]) == 0
     assert [cfg.task.yield_stress for cfg in seen] == [10, 20, 50, 100, 200, 1000]
     runs = {(cfg.task.name, cfg.variant, cfg.method.name, cfg.method.episodes) for cfg in seen}
     assert runs == {("Move", "3", "sac", 7)}

@@ -47,10 +47,8 @@ TABLES = "from plab.cli.report import main; assert main(['tables', 'example']) =
 )
 def test_starting_imports_nothing_heavy(code, allowed, tmp_path):
     code = f"import sys\n{code}\nprint(sorted({HEAVY - allowed} & set(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
+    shown = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True)
+    assert shown.splitlines()[-1] == "[]"
 
 
 CLIENT = """

@@ -243,7 +243,7 @@ def test_an_arm_is_one_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert info["score"] == pytest.approx(best.scores[0].score, abs=1e-6)
 
 
-def test_mistakes_in_a_model_are_named() -> None:
+def test_mistakes_in_a_model_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["task=Gripper", *COARSE]
     for wrong, named in (
         ("+task.kinematics.scale.finger=0.1", "task.kinematics: scale: 'finger' matches none of turn"),
@@ -256,3 +256,10 @@ def test_mistakes_in_a_model_are_named() -> None:
     ):
         with pytest.raises((ConfigError, SceneError), match=re.escape(named)):
             build_scene(load_config([*words, wrong]))
+    # The model of a result is found by its name, too.
+    cfg = load_config(words)
+    cfg.task.kinematics.model = "/gone/arm.xml"
+    with pytest.raises(ConfigError, match=r"task\.kinematics: there is no file /gone/arm\.xml: put it there"):
+        build_scene(cfg)
+    monkeypatch.chdir(Path(plab.__file__).with_name("kinematics") / "assets")
+    assert build_scene(cfg).kinematics is not None

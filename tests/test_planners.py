@@ -399,6 +399,8 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
     shorter, longer = sorted(results, key=lambda result: len(result.iterations))
     monkeypatch.setattr(checking, "SOLVED", shorter.iterations["score"].max())
     assert faults(shorter) == []
+    shorter.config["method"]["family"] = "own:FAMILY"
+    assert faults(shorter) == ["config_hash does not match config"]
     progress = capsys.readouterr().out
     counts = [int(count) for count in re.findall(r" (\d)/4,", progress)]
     assert counts == [*range(1, len(longer.iterations)), 4]

@@ -96,7 +96,12 @@ def test_details_have_curves_runs_and_commands(page: Path) -> None:
     assert x[0] == 1 and x[-1] == 6 and len(mean) == len(std) == len(x)
     command = details["adam"]["runs"][1]["command"]
     assert command.startswith("plab run task=Rope variant=1 method=adam seed=10")
-    assert "sim.particles_scale=0.03" in command and "sim.horizon=3" in command
+    assert "sim.particles_scale=0.03" in command and "sim.horizon=3" in command and "FOLDER" not in command
+    own = synthetic.config(page.parent, task="Own")
+    own["method"]["loss_weights"]["height"] = 2.0
+    assert _command(own).endswith(" +method.loss_weights.height=2.0 --config-dir FOLDER")
+    own["method"]["name"] = "mine"
+    assert " method.lr=0.1 " in _command(own) and " method.loss_weights.height=2.0 " in _command(own)
 
 
 REPEATED = (

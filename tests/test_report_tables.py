@@ -107,6 +107,13 @@ def test_distances_are_means_of_the_runs_that_have_them(tmp_path: Path) -> None:
     (row,) = table.cells.to_dict("records")
     shown = [row[name] for name in ("task", "distance", "Adam", "GD")]
     assert shown == ["Own", "Chamfer", "0.150 ± 0.050", NOTHING]
+    # Tasks of one's own have the variants of their runs; methods have different colours.
+    for name in ("mine", "other"):
+        save(tmp_path, {"method.name": name, "task.gravity": [0.0, -9.0, 0.0]}, task="Own", variant="soft")
+    runs = gather(tmp_path)
+    assert runs.variants == ["1", "soft"] and look("mine").colour != look("other").colour
+    assert len(gather(tmp_path, "task.gravity=[0,-9,0]").table) == 2
+    assert len(gather(tmp_path, "method.max_gradient_norm=null", "method.name=mine").table) == 1
 
 
 def test_differences_and_rows_per_configuration(folder: Path) -> None:

@@ -76,10 +76,13 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     assert (run.done, run.total, run.rate) == (66, 100, pytest.approx(33.0, rel=0.15))
     lock.release()
     # A solved planner has nothing left to do.
-    lock = acquire(begin(folder, 3, method="cem", score=3.0))
-    (run,) = find(folder, "method=cem").running.itertuples()
-    assert (run.done, run.total, run.score, run.left) == (4, 4, 1.0, 0.0)
-    lock.release()
+    for family in ("planner", "own:FAMILY"):
+        result = synthetic.cut(synthetic.run(folder, method="cem", score=3.0), 3)
+        result.config["method"]["family"] = family
+        lock = acquire(synthetic.save(dataclasses.replace(result, status="running", evaluation={})))
+        (run,) = find(folder, "method=cem").running.itertuples()
+        assert (run.done, run.total, run.score, run.left) == (4, 4, 1.0, 0.0)
+        lock.release()
     (run,) = find(folder, "method=ppo").runs.itertuples()
     assert (run.state, run.done, run.total) == ("interrupted", 66, 100)
     assert run.score >= 0.0 and np.isnan(run.rate)
@@ -87,17 +90,19 @@ def test_running_is_a_held_lock(folder: Path) -> None:
 
 def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
     locks = []
-    for seed in range(3):
-        result = synthetic.cut(synthetic.run(folder, task="Move", seed=seed), 3)
+    # Two more runs have been solved, and wait.
+    for seed, name in enumerate(["adam"] * 3 + ["cem"] * 2):
+        which = {"method": "cem", "score": 3.0} if name == "cem" else {}
+        result = synthetic.cut(synthetic.run(folder, task="Move", seed=seed, **which), 3)
         # 10 s for each of two iterations after the first.
-        result.provenance["batch"] = 3
+        result.provenance |= {"batch": 5, "active": 5 if which else 3}
         result.wall_time = {"optimise": 20.0}
         result.columns["seconds"] = np.full(3, 10.0)
         result.status, result.evaluation = "running", {}
         locks.append(acquire(synthetic.save(result)))
     found = find(folder, "task=Move", "variant=1")
     assert found.workers == 1
-    for run in found.running.itertuples():
+    for run in found.running.query("left > 0").itertuples():
         assert (run.together, run.rate) == (3, pytest.approx(0.1 / 3))
     # Three times ten seconds, less what has gone by since.
     assert 0.0 < found.eta <= 32.0 and found.running["left"].sum() <= 30.0

@@ -95,23 +95,12 @@ def with_manifest(path: Path, values: dict[str, Any], entry: int | None = None) 
 def test_round_trip_of_plans(path: Path) -> None:
     found = read(path)
     assert found.card == CARD and found.plab == plab.__version__ and found.track == "plans"
-    assert [(e.configuration.name, e.steps, e.score) for e in found.entries] == [
-        ("Move-v1", 100, 0.5),
-        ("Move-v2", 5000, 0.5),
-    ]
+    entries = [(e.configuration.name, e.steps, e.score) for e in found.entries]
+    assert entries == [("Move-v1", 100, 0.5), ("Move-v2", 5000, 0.5)]
     assert all(np.array_equal(e.actions, ACTIONS) and e.checksum == CHECKSUM for e in found.entries)
     assert encode(found) == path.read_bytes()
     wrong = path.with_name("mine.zip")
     assert str(wrong) in why(write, found, wrong)
-
-
-def test_round_trip_of_policies(tmp_path: Path) -> None:
-    policy, made = {"policies/Move.pt": b"some program"}, tmp_path / "p.plabsub.zip"
-    entries = [entry(v, actions=None, policy="policies/Move.pt") for v in ("1", UNSEEN[0])]
-    write(Submission(CARD, tuple(entries), policy), made)
-    found = read(made)
-    assert (found.track, found.policies) == ("policies", policy)
-    assert [e.policy for e in found.entries] == ["policies/Move.pt"] * 2
 
 
 def test_files_that_are_damaged_or_lead_elsewhere(path: Path) -> None:
@@ -207,12 +196,7 @@ def test_cards_that_are_read() -> None:
 @pytest.mark.parametrize(
     ("line", "fault"),
     [
-        # Nested merge keys, which expand to 9^11 values.
-        (
-            "a0: &a0 {x: 1}\n"
-            + "".join(f"a{i + 1}: &a{i + 1}\n  <<: [{f'*a{i}, ' * 9}]\n" for i in range(11)),
-            "alias",
-        ),
+        ("a: &a {x: 1}\nb: *a", "alias"),
         ("budget: 0x" + "f" * 7000, "budget"),
         ('name: "\\e[31mred"', "control"),
         ('authors: ["\\ud800"]', "control"),
@@ -335,10 +319,8 @@ def test_scores_are_means_of_whole_tables_within_budgets(leaders) -> None:
     policy = lines["policy"]
     assert policy["status"] == "claimed"
     assert policy["budgets"] == [None, None, None, pytest.approx(0.6 / 50)]
-    (unseen,) = sections["Unseen configurations"]["lines"]
-    assert (
-        unseen["score"] == pytest.approx(0.6 / 100) and sections["Unseen configurations"]["expected"] == 100
-    )
+    unseen = sections["Unseen configurations"]
+    assert (unseen["lines"][0]["score"], unseen["expected"]) == (pytest.approx(0.6 / 100), 100)
 
 
 def test_what_does_not_belong_is_left_out_with_a_reason(leaders, folder: Path) -> None:
@@ -353,7 +335,6 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
     assert {one.outcome for one in found} == {HOLDS}
     kept = json.loads((folder / "plans.verified.json").read_text())
     assert kept["tolerance"] == TOLERANCE and kept["entries"][1]["score"] == 0.8
-
     for path in folder.glob("plans.*"):
         shutil.copy(path, tmp_path)
     path = with_manifest(tmp_path / "plans.plabsub.zip", {"score": 0.9}, 1)

@@ -6,15 +6,18 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from plab import problem
 from plab.config import Config, ConfigError, load_config
 from plab.problem import Problem
 from plab.results import RunResult, check, read
 from plab.runners import run_batch
 from plab.sweep.execution import plan
+from plab.targets import TargetError
 from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_ROPE as COARSE
 
@@ -128,6 +131,17 @@ def test_runs_stopped_at_different_iterations_go_on_together(tmp_path: Path, alo
     assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
     for cfg, want in zip(cfgs, alone, strict=True):
         assert finished_as(cfg, want).provenance["resumed"] == 1
+
+
+def test_a_mistake_in_some_configurations_builds_one_more_simulator(tmp_path: Path, monkeypatch) -> None:
+    words = [*COARSE, "method.iterations=1", "progress=false", f"results_dir={tmp_path}"]
+    cfgs = [load_config([*words, f"variant={k // 2 + 1}", f"seed={k}"]) for k in range(6)]
+    zeros = np.zeros([cfgs[0].sim.grid_size] * 3)
+    distances = Mock(side_effect=[zeros, TargetError("the target is empty"), *[zeros] * 3])
+    monkeypatch.setattr(problem, "target_distance", distances)
+    ended = [one.status for one in run_batch(cfgs, cache=CACHE)]
+    assert distances.call_count == 3 + 2  # of two builds
+    assert ended == [*["finished"] * 2, *["refused"] * 2, *["finished"] * 2]
 
 
 OPTIMISER = """
