@@ -126,7 +126,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     finished, unusual = _prefer_usual(complete, split)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
-    columns = None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
+    columns = None if finished else [*NAMES, "score", "best_iteration", "config_hash", "path", *KEYS]
     counts = {
         "left out: not finished": len(inside) - len(complete),
         f"left out: request them by {advice}": len(ended) - len(complete),
