@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import sys
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
@@ -67,6 +68,13 @@ def print_error(message: str) -> None:
 def out_of_memory(error: MemoryError) -> str:
     """Return a one-line message about insufficient memory, because Python's own message is empty."""
     return str(error) or "out of memory: close other programs, or use fewer particles or environments"
+
+
+def describe_bug(error: Exception) -> str:
+    """Describe an unexpected error with its last place in plab or the user's files, not in a library."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if not one.filename.startswith((sys.prefix, sys.base_prefix))] or frames
+    return f"{type(error).__name__} in {own[-1].filename}, line {own[-1].lineno}: {error}"
 
 
 def traceback_wanted() -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import sys
-import traceback
 from collections import UserDict
 from collections.abc import Mapping
 from importlib import import_module
@@ -17,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from plab.errors import ConfigError, suggest
+from plab.errors import ConfigError, describe_bug, suggest
 
 Kind = TypeVar("Kind")
 
@@ -110,7 +109,4 @@ def _imported(text: str, name: str) -> ModuleType:
     except SyntaxError as error:
         raise ConfigError(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
     except Exception as error:
-        # Traceback in the module's own code, for its author.
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{last.filename}, line {last.lineno}"
-        raise ConfigError(f"'{text}': {where}: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"'{text}': {describe_bug(error)}") from error

@@ -13,7 +13,6 @@ import re
 import signal
 import sys
 import threading
-import traceback
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,6 +24,7 @@ from plab.errors import (
     TRACEBACK,
     ArgumentError,
     PlabError,
+    describe_bug,
     out_of_memory,
     print_error,
     printable,
@@ -83,9 +83,7 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         except Exception as error:
             if traceback_wanted():
                 raise
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            where = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}"
-            print_error(f"a bug: {where}: {error}; please report it with the output of {TRACEBACK}=1")
+            print_error(f"a bug: {describe_bug(error)}; report plab's with the output of {TRACEBACK}=1")
             return EXIT_BUG
         return PlabError.exit_code
 

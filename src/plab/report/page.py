@@ -186,7 +186,8 @@ def _command(config: Mapping[str, Any]) -> str:
     chosen = {"method.name": (method["name"], file), "protocol": (config["protocol"]["name"], "plab")}
     chosen["sim.device"] = config["sim"]["device"], "cpu"
     words += [f"{key}={value}" for key, (value, default) in chosen.items() if value != default]
-    changed, usual = changed_settings({**config, "method": {**method, "name": file}}), shipped_file("method", file)
+    changed = changed_settings({**config, "method": {**method, "name": file}})
+    usual = shipped_file("method", file)
     if "method.planner.name" in changed:
         # Another planner has other keys.
         words.append(f"method@method.planner={changed['method.planner.name']}")
