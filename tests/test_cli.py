@@ -106,7 +106,7 @@ def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code, nam
         with pytest.raises(type(error), match="a bug"):
             main([])
         monkeypatch.delenv("PLAB_TRACEBACK")
-        named = f"{named} in test_cli.py, line {failing.__code__.co_firstlineno + 2}"
+        named = f"{named} in {__file__}, line {failing.__code__.co_firstlineno + 2}"
     assert main([]) == code
     line = capsys.readouterr().err
     assert line.startswith("plab: ") and line.count("\n") == 1 and named in line

@@ -42,7 +42,7 @@ def test_modules_are_found_in_the_config_folder_and_above_it(folder: Path, monke
     # Environments are registered before the user's modules are imported.
     (folder / "zz_made.py").write_text("import gymnasium\nraise OSError(gymnasium.spec('plab/Rope-v2').id)")
     command = [sys.executable, "-m", "plab", "run", "--config-dir", str(folder), "method.family=zz_made:A"]
-    assert "OSError: plab/Rope-v2" in subprocess.run(command, capture_output=True, text=True).stderr
+    assert "line 2: plab/Rope-v2" in subprocess.run(command, capture_output=True, text=True).stderr
     monkeypatch.setenv("PYTHONPATH", "zz_before")
     export_module_path()
     assert os.environ["PYTHONPATH"].endswith(f"{os.pathsep}zz_before")
