@@ -140,6 +140,10 @@ def test_parameters_are_found_from_observations(tmp_path: Path, observation: str
         run_config(again, CACHE)
     run_config(again, CACHE)
     finished_as(again, result)
+    # Above 4,875 the raised modulus is unstable with this time step.
+    stiff = ["method.parameters=[youngs_modulus]", "method.difference=0.5", "task.youngs_modulus=3000"]
+    found = run(load_config([*words, *fit, *stiff, "task.yield_stress=50", f"results_dir={tmp_path}/c"]))
+    assert 4500.0 < found.iterations["youngs_modulus"].iloc[-1] < 4876.0
     with pytest.raises(ConfigError, match=r"method\.parameters"):
         load_config([*words, *fit, "method.parameters=[mass]"])
 

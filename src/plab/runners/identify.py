@@ -11,6 +11,7 @@ reproduce a result:
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -23,6 +24,7 @@ import numpy as np
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family
 from plab.runners.runner import Runner, Step, Track, shared_problem
+from plab.scenes import SceneError
 
 if TYPE_CHECKING:
     from plab.scenes import Camera, Scene
@@ -34,8 +36,6 @@ PARAMETERS = (
 """Parameters that can be fitted; ``manipulator_friction`` is common to all manipulators, and gravity is the
 downward acceleration. The density is not identifiable: with manipulators on prescribed paths, motion depends
 only on the ratios of moduli and yield stress to it."""
-
-HIGHEST_POISSON_RATIO = 0.49
 
 BLOCKS = 16
 """Blocks of pixels along the height of an image: mean depths are linear in the motion of a silhouette."""
@@ -140,37 +140,38 @@ class IdentifyRunner(Runner):
         first = [_value(self.problem.scenes[0], name) for name in self.method.parameters]
         if min(first) <= 0.0:
             raise ConfigError("fitted parameters must be positive initially")
-        highest = {"poisson_ratio": math.log(HIGHEST_POISSON_RATIO)}
-        self._highest = np.array([highest.get(name, math.inf) for name in self.method.parameters])
-        logs, count = np.minimum(np.log(first), self._highest), len(first)
-        self._state: dict[str, Any] = {"trial": logs, "best": logs, "cost": np.inf}
-        linear = {"curvature": np.zeros((count, count)), "slope": np.zeros(count)}
-        self._state |= {"damping": self.method.damping} | linear
+        logs, damping = np.log(first), self.method.damping
+        self._state: dict[str, Any] = {"trial": logs, "best": logs, "cost": np.inf, "damping": damping}
         if state is not None:
             self._state = {name: np.array(value) for name, value in state.items()}
 
     def step(self, track: Track) -> Step:
         """Simulate the trial and its perturbations, accept it if it fits better, and compute the next one."""
+        from plab.sim.batch import require_alike
+
         method, state = self.method, self._state
-        changes = np.eye(len(method.parameters)) * method.difference
-        trials = state["trial"] + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
-        seen, measured = self._simulate(np.exp(np.minimum(trials, self._highest)))
+        scenes, count = self._scenes(state["trial"]), len(method.parameters)
+        seen, measured = self._simulate(scenes)
         residual = (seen[0] - self._observed).ravel()
         cost = float(residual @ residual)
         if cost < state["cost"]:
-            up, down = np.split(seen[1:].reshape(2 * len(changes), -1), 2)
-            beyond = np.maximum(state["trial"] + method.difference - self._highest, 0.0)
-            slopes = (up - down) / (2.0 * method.difference - beyond)[:, None]
+            up, down = np.split(seen[1:].reshape(2 * count, -1), 2)
+            slopes = (up - down) / (2.0 * method.difference)
             linear = {"curvature": slopes @ slopes.T, "slope": slopes @ residual}
             state |= {"best": state["trial"], "cost": cost, "damping": state["damping"] / 3.0} | linear
         else:
             state |= {"damping": max(4.0 * state["damping"], 1e-6)}
         damped = state["curvature"] + state["damping"] * np.diag(np.diag(state["curvature"]))
         way = np.linalg.lstsq(damped, -state["slope"], rcond=None)[0]
-        # A step changes parameters by at most a factor of 2.
-        trial = state["best"] + way / max(1.0, np.abs(way).max() / np.log(2.0))
-        state["trial"] = np.minimum(trial, self._highest)
-        variance = state["cost"] / max(residual.size - len(changes), 1)
+        # A step changes parameters by at most a factor of 2, and to values that can be simulated.
+        way /= max(1.0, np.abs(way).max() / np.log(2.0))
+        while True:
+            with contextlib.suppress(SceneError):
+                require_alike(self._scenes(state["best"] + way))
+                break
+            way *= 0.5
+        state["trial"] = state["best"] + way
+        variance = state["cost"] / max(residual.size - count, 1)
         deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
         # Parameters without effect, such as floor friction while bodies stick.
         deviations[np.diag(state["curvature"]) == 0.0] = np.nan
@@ -179,7 +180,7 @@ class IdentifyRunner(Runner):
         found["misfit"] = float(np.sqrt(each * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
             found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
-        steps = len(self._actions) * len(trials)
+        steps = len(self._actions) * len(scenes)
         return Step(measured | found, self._actions, dict(state), steps_forward=steps)
 
     def close(self) -> None:
@@ -192,12 +193,16 @@ class IdentifyRunner(Runner):
         fit = (f"{n} {means[n]:.4g} ± {means[f'{n}_deviation']:.2g}" for n in self.method.parameters)
         return f"misfit {means['misfit']:.3g}, {', '.join(fit)}"
 
-    def _simulate(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
-        """Return what is observed after each step, shape [environment, T, ...], with parameters of shape
-        [environment, parameter], and the measures of the first episode."""
+    def _scenes(self, logs: np.ndarray) -> list[Scene]:
+        """Return the scenes of a trial and of its perturbations, given the logarithms of its parameters."""
+        changes = np.eye(len(logs)) * self.method.difference
+        values = np.exp(logs + np.concatenate([np.zeros((1, len(logs))), changes, -changes]))
+        return [_changed(self.problem.scenes[0], self.method.parameters, own) for own in values]
+
+    def _simulate(self, scenes: list[Scene]) -> tuple[np.ndarray, dict[str, float]]:
+        """Return the observations after each step, shape [scene, T, ...], and the first scene's measures."""
         problem, simulator = self.problem, self.problem.simulator
-        scene = problem.scenes[0]
-        simulator.set_scenes([_changed(scene, self.method.parameters, own) for own in values])
+        simulator.set_scenes(scenes)
         simulator.set_contact("hard")
         first, terms, seen = problem.loss_of(simulator.measure().terms)[0], [], []
         for action in self._actions:
