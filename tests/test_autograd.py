@@ -14,6 +14,7 @@ from plab.envs.autograd import policy_gradient, rollout, simulate
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
+from plab.sim import SimulationError
 from toy_runner import COARSE_ROPE
 
 HORIZON = 3
@@ -86,7 +87,7 @@ def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBat
         got = env.step(action)
         np.testing.assert_array_equal(got.observation.numpy(), want.observation)
         np.testing.assert_array_equal(got.reward.numpy(), want.reward.astype(np.float32))
-        assert got.info.keys() == want.info.keys()
+        assert got.info.keys() == want.info.keys() and got.info["success"].dtype == torch.bool
         assert got.truncated.all() == want.truncated.all() == (t == HORIZON - 1)
     env.reset()
     assert env.step(torch.ones((4, 6), dtype=torch.int32)).reward.dtype == torch.float64
@@ -151,6 +152,9 @@ def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None
     parts = [policy_gradient(episodes, policy, steps) for steps in (1, HORIZON - 1)]
     with pytest.raises(ResetNeeded, match="the episode is over"):
         policy_gradient(episodes, policy, 1)
+    observation, info = episodes.set_state(episodes.get_state())
+    np.testing.assert_array_equal(observation, parts[1].observations[-1].float().numpy())
+    np.testing.assert_array_equal(info["loss"], parts[1].loss[-1].numpy())
     observation, _ = episodes.reset()
     for t in range(HORIZON):
         part, k = (parts[0], t) if t < 1 else (parts[1], t - 1)
@@ -187,3 +191,8 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     episodes.reset()
     with pytest.raises(ValueError, match=r"\(4, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)
+    broken = episodes.get_state()
+    broken.simulation.v[1] = 1e9
+    episodes.set_state(broken)
+    with pytest.raises(SimulationError, match="environment 1, environment step 1"):
+        policy_gradient(episodes, network(episodes, 6), HORIZON)

@@ -138,7 +138,7 @@ def test_tensors_by_key_stay_on_the_device():
     env = TensorEnv(EpisodeBatch(cfgs, observe=["state", "rgb", "impulses"]))
     first = env.reset()
     later = env.step(torch.ones(2, env.batch.action_space.shape[0], device=env.device)).observation
-    again = env.reset(environments=[1])["impulses"]
+    again = env.reset(environments=np.array([False, True]))["impulses"]
     assert torch.equal(again[0], later["impulses"][0]) and again[0].any() and not again[1].any()
     for seen in (first, later):
         assert {value.device.type for value in seen.values()} == {DEVICE}

@@ -65,10 +65,6 @@ class _Rollout(torch.autograd.Function):
         return loss_bar[:, None, None] * gradient, None, None
 
 
-def _numbers(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy()
-
-
 class States(NamedTuple):
     """States after environment steps, each of shape [batch, T, ...]; T is 1 for the last state only.
 
@@ -107,8 +103,8 @@ def simulate(
             simulator's precision.
         every_step: Whether to return the state after every environment step instead of only the last one.
         mass: Whether to return mass tensors, too.
-        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] if
-            bodies have their own materials; default: unchanged.
+        material: Parameters, see :attr:`plab.sim.Simulator.material_keys`, shape [parameter], [batch,
+            parameter] or, if bodies have their own materials, [batch, body, parameter]; default: unchanged.
         **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. Like the material,
             they are stored in the simulator.
 
@@ -144,13 +140,14 @@ class _States(torch.autograd.Function):
         *initial: torch.Tensor | None,
     ) -> tuple[torch.Tensor, ...]:
         if material is not None:
-            simulator.set_material(*np.moveaxis(_numbers(material), -1, 0))
-        parts = {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None}
+            simulator.set_material(*material.detach().cpu().double().unbind(-1))
+        given = zip(_FIELDS, initial, strict=True)
+        parts = {name: part.detach().cpu().double().numpy() for name, part in given if part is not None}
         if parts:
             simulator.reset()
             simulator.set_initial_state(replace(simulator.state(), **parts))
-        given = simulator_input(actions, simulator)
-        recording = simulator.record(given, every_step=every_step, mass=mass, gradient=gradient)
+        moves = simulator_input(actions, simulator)
+        recording = simulator.record(moves, every_step=every_step, mass=mass, gradient=gradient)
         ctx.simulator, ctx.recording = simulator, recording
         ctx.likes = actions, material, *initial
         ctx.set_materialize_grads(False)
@@ -171,9 +168,9 @@ class _States(torch.autograd.Function):
         gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions), None]
         if ctx.needs_input_grad[5]:
             by_material = ctx.simulator.material_gradient()
-            if by_material.ndim > material.ndim:
-                # One for all bodies.
-                by_material = by_material.sum(axis=1)
+            # One for all environments or bodies.
+            shared = tuple(range(material.ndim - 1, by_material.ndim - 1))
+            by_material = by_material.sum(axis=shared)[..., : material.shape[-1]]
             gradients[1] = torch.as_tensor(by_material).to(material)
         wanted = ctx.needs_input_grad[6:]
         state: State | None = ctx.simulator.state_gradient() if any(wanted) else None

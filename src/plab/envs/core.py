@@ -378,7 +378,7 @@ class EpisodeBatch:
 
         Args:
             like: If a CUDA tensor, results are CUDA tensors.
-            environments: Numbers of the sub-environments to reset; default: all.
+            environments: Numbers or mask of the sub-environments to reset; default: all.
             seeds: Seeds of these environments, which restart their random sequences; default: continue.
             episode: Number of the episode, or of each, which determines the samples; default: the next.
             options: Values by dotted key of the task that replace samples, for all of these sub-environments
@@ -393,7 +393,8 @@ class EpisodeBatch:
             RuntimeError: If the environment is closed or its simulator is invalid, as in all other methods.
         """
         self._follow_changes(keep=environments is not None)
-        rows = list(range(self.size) if environments is None else map(int, environments))
+        chosen = slice(None) if environments is None else list(_on_host(environments))
+        rows = np.arange(self.size)[chosen].tolist()
         if seeds is not None:
             for e, seed in zip(rows, seeds, strict=True):
                 self._seeds[e], self._episodes[e] = (int(seed),), -1
@@ -583,6 +584,7 @@ class EpisodeBatch:
             steps, chosen, reaction, stride=observer.stride, discount=discount, like=like
         )
         self._steps = taken + steps
+        self._update(self._observe(like), self._measured(like), kept=list(self.failures))
         return terms
 
     @_alone

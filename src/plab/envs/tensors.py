@@ -56,14 +56,15 @@ class TensorEnv:
         Arguments and errors are those of :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
-            Tensors; observations are float32, all others have the type of the actions, or the simulator's
-            precision for integer actions. ``terminated``, ``truncated`` and sampled parameters are arrays.
+            Tensors; observations are float32, other numbers have the type of the actions, or the simulator's
+            precision for integer actions; ``success`` is a mask. ``terminated``, ``truncated`` and sampled
+            parameters are arrays.
         """
         actions = floating(actions.detach().to(self.device), self.batch.problem.simulator)
         if self.device.type == "cuda":
             return self.batch.step(actions, strict=strict)
         done = self.batch.step(actions.double().numpy(), strict=strict)
-        numbers = {name: values for name, values in done.info.items() if name != "randomized"}
-        info = done.info | {name: torch.as_tensor(values).to(actions) for name, values in numbers.items()}
+        tensors = {name: torch.as_tensor(own) for name, own in done.info.items() if name != "randomized"}
+        info = done.info | {n: t if t.dtype == torch.bool else t.to(actions) for n, t in tensors.items()}
         reward = torch.as_tensor(done.reward).to(actions)
         return replace(done, observation=mapped(torch.as_tensor, done.observation), reward=reward, info=info)
