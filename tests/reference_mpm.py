@@ -53,13 +53,8 @@ def initial_state(scene: Scene, x: Tensor | None = None) -> State:
     """State at t = 0, at rest and undeformed; particles x [particle, 3] are sampled unless given."""
     x = torch.as_tensor(sample_particles(scene) if x is None else x, dtype=torch.float64)
     rows = [(*m.position, *m.rotation, m.gap) for m in scene.manipulators]
-    return State(
-        x=x,
-        v=torch.zeros_like(x),
-        C=torch.zeros(len(x), 3, 3, dtype=torch.float64),
-        F=_identity().repeat(len(x), 1, 1),
-        poses=torch.tensor(rows, dtype=torch.float64).reshape(-1, 8),
-    )
+    v, F = torch.zeros_like(x), _identity().repeat(len(x), 1, 1)
+    return State(x, v, torch.zeros_like(F), F, torch.tensor(rows, dtype=torch.float64).reshape(-1, 8))
 
 
 def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:

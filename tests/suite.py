@@ -133,6 +133,14 @@ class Kinetic(ParticleTerm):
         return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
 
 
+def moving_start(simulator: Simulator, strain: float) -> State:
+    """Moving state with distinct singular values; a ``strain`` of 0.15 is out of the series' range."""
+    rng = np.random.default_rng(11)
+    rest = simulator.state()
+    v, c = rng.normal(size=rest.v.shape), rng.normal(scale=20.0, size=rest.C.shape)
+    return State(rest.x, v, c, np.eye(3) + rng.normal(scale=strain, size=c.shape), rest.poses)
+
+
 def reference_state(state: State, e: int) -> reference.State:
     """State of one environment for the reference implementation."""
     import torch

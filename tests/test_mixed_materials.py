@@ -14,7 +14,7 @@ import suite
 from plab.envs.autograd import simulate
 from plab.losses import make_terms
 from plab.scenes import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
-from plab.sim import Simulator, State
+from plab.sim import Simulator
 
 WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}
 WEIGHT = np.array(list(WEIGHTS.values()))
@@ -60,17 +60,9 @@ def simulator(compiled: Simulator) -> Simulator:
     return compiled
 
 
-def start(simulator: Simulator, strain: float) -> State:
-    """Moving state with distinct singular values; a ``strain`` of 0.15 is out of the series' range."""
-    rng = np.random.default_rng(11)
-    rest = simulator.state()
-    v, c = rng.normal(size=rest.v.shape), rng.normal(scale=20.0, size=rest.C.shape)
-    return State(rest.x, v, c, np.eye(3) + rng.normal(scale=strain, size=c.shape), rest.poses)
-
-
 @pytest.mark.parametrize("strain", [0.02, 0.15])
 def test_states_and_gradients_are_those_of_the_reference(simulator, strain):
-    given = start(simulator, strain)
+    given = suite.moving_start(simulator, strain)
     simulator.set_initial_state(given)
     got, end, bar = simulator.rollout(ACTIONS), simulator.state(), simulator.state_gradient().F
     empty = torch.zeros(SDF.shape[1:], dtype=torch.float64)
@@ -106,7 +98,7 @@ def differences(simulator: Simulator, key: str, body: int, width: float) -> np.n
 
 @pytest.mark.parametrize("strain", [0.02, 0.15])
 def test_the_gradient_of_each_body_is_that_of_central_differences(simulator, strain):
-    simulator.set_initial_state(start(simulator, strain))
+    simulator.set_initial_state(suite.moving_start(simulator, strain))
     simulator.rollout(ACTIONS)
     gradient = simulator.material_gradient()
     assert gradient.shape == (len(SCENES), 2, 3)
@@ -128,7 +120,7 @@ def test_materials_can_be_set(simulator):
     assert simulator.scenes[0].materials[0].poisson_ratio == 0.3
     # Bodies that were elastic yield.
     simulator.set_material(youngs_modulus=[[2000.0, 4000.0]])
-    given = start(simulator, 0.05)
+    given = suite.moving_start(simulator, 0.05)
     simulator.set_state(given)
     simulator.step(ACTIONS[:, 0])
     for e, scene in enumerate(simulator.scenes):

@@ -22,7 +22,7 @@ from plab.scenes import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator
 from plab.sweep.execution import plan
 from plab.targets import TargetError
-from suite import CENTER, assert_same_state, reference_state, scene, tools
+from suite import CENTER, assert_same_state, moving_start, reference_state, scene, tools
 from toy_runner import COARSE
 
 WEIGHTS = (10.0, 10.0, 1.0)
@@ -71,13 +71,7 @@ def test_states_and_gradients_agree_with_the_reference(
     sdf = rng.random(mass.shape)
     simulator.set_target(mass, sdf)
     # A moving, strained start: autograd needs distinct singular values.
-    rest, rng = simulator.state(), np.random.default_rng(11)
-    start = replace(
-        rest,
-        v=rng.normal(size=rest.v.shape),
-        C=rng.normal(scale=20.0, size=rest.C.shape),
-        F=np.eye(3) + rng.normal(scale=0.02, size=rest.F.shape),
-    )
+    start = moving_start(simulator, 0.02)
     assert (start.x[..., 1] * n < 0.5).any(axis=1).all()
     u = np.random.default_rng(7).uniform(-0.9, 0.9, (len(SCENES), 2, SCENES[0].action_dim))
     simulator.set_initial_state(start)

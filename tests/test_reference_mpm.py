@@ -19,15 +19,8 @@ IDENTITY = torch.eye(3, dtype=torch.float64)
 
 def make_scene(**changes: object) -> Scene:
     """Block of 40 particles in mid-air on a coarse grid."""
-    scene = Scene(
-        "test",
-        bodies=(Body("box", (0.5, 0.5, 0.5), (0.25, 0.2, 0.25), 40),),
-        manipulators=(),
-        grid_size=16,
-        dt=4e-4,
-        substeps=3,
-    )
-    return replace(scene, **changes)
+    body = Body("box", (0.5, 0.5, 0.5), (0.25, 0.2, 0.25), 40)
+    return replace(Scene("test", (body,), (), grid_size=16, dt=4e-4, substeps=3), **changes)
 
 
 def random_matrices(shape: tuple[int, ...], scale: float, seed: int = 0) -> Tensor:
