@@ -210,6 +210,8 @@ def test_the_way_back_is_refused_once_it_is_gone(full: Simulator) -> None:
     full.reset()
     with pytest.raises(RuntimeError, match="pull back"):
         states.x.sum().backward()
+    with pytest.raises(RuntimeError, match="no gradient of the last"):
+        full.state_gradient()
     with pytest.raises(TypeError, match="'y'"):
         simulate(full, u, y=u)
     recording = full.record(np.zeros((2, 1, full.action_dim)))

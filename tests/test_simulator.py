@@ -149,9 +149,7 @@ def test_states_that_are_not_finite_are_named(sim: Simulator) -> None:
     make_not_finite(sim, 1)
     with pytest.raises(SimulationError, match="environment 1, environment step 1, substep 1"):
         sim.step(idle)
-    sim.reset()
-    sim.step(idle)
-    sim.step(idle)
+    sim.rollout(np.zeros((3, 2, 6)), gradient=False)
     state = sim.state()
     state.v[1, 7, 0] = math.nan
     sim._particles.current.from_numpy(sim._particles.pack(state))
@@ -207,6 +205,7 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         (lambda: sim.set_target(*grids[::-1]), r"target mass: environment 2, node \(3, 4, 5\)"),
         (lambda: sim.set_scenes(SCENES[::-1], particles=out.x), r"particles\[1\]: particle 2 is at"),
         (lambda: sim.set_material(poisson_ratio=0.7), "poisson_ratio"),
+        (lambda: sim.set_material(1.0, 0.2, 3.0, 4.0), "4 values for 3 parameters"),
         (lambda: replace(ball(), dt=0.1).validate(), "substeps >= "),
         (lambda: ball(center=(0.5, 0.95, 0.5)).validate(), "outside the domain"),
         (lambda: make([ball()], particles=[np.full((7, 3), 0.5)]), "particles are 7, .* has 300"),
@@ -220,6 +219,7 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         (lambda: make([ball(), replace(ball(), manipulators=())]), "manipulators"),
         (lambda: Simulator(SCENES, device="gpu"), "device 'gpu' is not one of cpu, cuda"),
         (lambda: make(SCENES, precision="f64"), "precision 'f64' is not one of float32, float64"),
+        (lambda: make(SCENES, terms=sim.terms), "term 'density' belongs to another simulator"),
     ):
         with pytest.raises(ValueError, match=named) as caught:
             call()
@@ -285,6 +285,9 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
     # All 22 states were kept; with checkpoints fewer do.
     sim.memory_mb = (sim.memory_bytes() - 9 * sim._particles.slot_bytes) / 1e6
     results = [(sim.rollout(ACTIONS), sim.state())]
+    recording, last = sim.record(ACTIONS), sim.losses()
+    np.testing.assert_array_equal(*(recording.pullback(x=recording.x) for _ in range(2)))
+    np.testing.assert_array_equal(sim.losses(), last)
     alone = built(SCENES[:1], "cpu", threads=2 if sim._runtime.threads == 1 else 1)
     results.append((alone.rollout(ACTIONS[:1]), alone.state()))
     for got, state in results:
@@ -292,6 +295,9 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
         np.testing.assert_array_equal(got.step_terms, want.step_terms[:count])
         np.testing.assert_array_equal(got.gradient, want.gradient[:count])
         np.testing.assert_array_equal(state.x, final.x[:count])
+    for call in (recording.pullback, partial(sim.set_contact, "hard"), sim.losses, sim.memory_bytes):
+        with pytest.raises(RuntimeError, match="simulator is invalid"):
+            call()
 
 
 def test_impulses_are_the_momentum_that_bodies_lose(device: str) -> None:

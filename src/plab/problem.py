@@ -150,7 +150,7 @@ class Problem:
         scenes: One scene per environment.
         simulator: Simulator, in its initial state.
         term_names: Names of the loss terms with nonzero weight.
-        weights: Their weights, shape [term].
+        weights: Their weights in losses and rewards, shape [term], also after ``simulator.set_weights``.
         labels: Labels with units, by column of results.
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
         initial_iou: Soft IoUs of the initial states with the targets, shape [batch].

@@ -249,6 +249,7 @@ def test_gradients_by_initial_poses(touched: Simulator) -> None:
     kinds = [kind for kind in KINDS if kind != "Cylinder"]
     points = [Point(start((kind,))) for kind in kinds]
     touched.rollout(put(touched, points))
+    touched.loss_gradient()
     bar = touched.state_gradient().poses
     for e, kind in enumerate(kinds):
         m = KINDS.index(kind)
@@ -350,8 +351,9 @@ def test_functions_of_states_are_differentiated(every_step: bool, touched: Simul
     values = {
         "u": torch.tensor(rng.uniform(-0.9, 0.9, (BATCH, 3, simulator.action_dim)), requires_grad=True),
         "x": torch.tensor(simulator.state().x, requires_grad=True),
-        "material": torch.tensor([[5000.0, 0.2, 50.0]] * BATCH, dtype=torch.float64, requires_grad=True),
     }
+    material = torch.tensor([5000.0, 0.2, 50.0], dtype=torch.float64)
+    values["material"] = (material if every_step else material.repeat(BATCH, 1)).requires_grad_()
     random = torch.Generator().manual_seed(0)
     masks: list[torch.Tensor] = []
 

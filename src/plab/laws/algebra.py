@@ -53,11 +53,7 @@ def det(a):
 
 def det_sym(s):
     """Determinant of a symmetric matrix."""
-    return (
-        s[0] * (s[1] * s[2] - s[5] * s[5])
-        - s[3] * (s[3] * s[2] - s[5] * s[4])
-        + s[4] * (s[3] * s[5] - s[1] * s[4])
-    )
+    return det(mat_from_sym(s))
 
 
 def inverse_sym(s):

@@ -87,20 +87,11 @@ class CameraSensor:
             height, width], float32. ``segmentation``: labels, see :data:`BACKGROUND`, same shape, int32.
             ``rgb``: shape [batch, height, width, 3], uint8.
         """
-        simulator, camera = self._simulator, self.camera
-        simulator._require_runtime()
-        particles = simulator._particles
+        self._simulator._require_runtime()
+        particles, camera = self._simulator._particles, self.camera
         self._trace(self._frame, self._keys, camera.focal_length, camera.near, camera.far)
-        self._splat(
-            particles.current,
-            particles.numbers,
-            self._frame,
-            self._balls,
-            self._labels,
-            self._keys,
-            camera.focal_length,
-            camera.near,
-        )
+        arrays = particles.current, particles.numbers, self._frame, self._balls, self._labels, self._keys
+        self._splat(*arrays, camera.focal_length, camera.near)
         out = {}
         for name in names or ("depth", "segmentation", "rgb"):
             depth = name == "depth"
@@ -234,14 +225,8 @@ class CameraSensor:
         that is nearer in depth."""
         here = self.point(keys, frame, e, row, column, focal)
         across = ti.static(0 if down else 1)
-        after = self.point(
-            keys,
-            frame,
-            e,
-            ti.min(row + down, self.height - 1),
-            ti.min(column + across, self.width - 1),
-            focal,
-        )
+        lower, right = ti.min(row + down, self.height - 1), ti.min(column + across, self.width - 1)
+        after = self.point(keys, frame, e, lower, right, focal)
         before = self.point(keys, frame, e, ti.max(row - down, 0), ti.max(column - across, 0), focal)
         forward, backward = after - here, here - before
         use_backward = (backward.norm() < forward.norm() and backward.norm() > 0.0) or forward.norm() == 0.0

@@ -124,13 +124,12 @@ class ParticlePhases(Storage):
             entry = self.tile_entry(0, e, place // self.lanes)
             lane = place % self.lanes
             for i in range(STATE):
-                value = 0.0
-                if i == AT_F or i == AT_F + 4 or i == AT_F + 8:
-                    value = 1.0
+                value = ti.cast(0.0, self.real)
                 if i < 3:
-                    target[entry + i][lane] = ti.cast(x[3 * order[place] + i], self.real)
-                else:
-                    target[entry + i][lane] = ti.cast(value, self.real)
+                    value = ti.cast(x[3 * order[place] + i], self.real)
+                elif i == AT_F or i == AT_F + 4 or i == AT_F + 8:
+                    value = 1.0
+                target[entry + i][lane] = value
 
     @ti.func
     def stencil(self, x):

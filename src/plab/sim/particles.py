@@ -243,11 +243,5 @@ class Particles:
         flat = rows.reshape(b, -1, STATE)[:, :n]
         values = np.empty((b, n, STATE))
         np.put_along_axis(values, order[:, :, None], flat.astype(np.float64), axis=1)
-        shape = (b, n, 3, 3)
-        return State(
-            values[..., :AT_V],
-            values[..., AT_V:AT_C],
-            values[..., AT_C:AT_F].reshape(shape),
-            values[..., AT_F:].reshape(shape),
-            poses,
-        )
+        x, v, c, f = np.split(values, (AT_V, AT_C, AT_F), axis=2)
+        return State(x, v, c.reshape(b, n, 3, 3), f.reshape(b, n, 3, 3), poses)

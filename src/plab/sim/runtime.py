@@ -234,11 +234,12 @@ def own_fields(owner: object) -> None:
         weakref.finalize(owner, _dropped.append, (_current, handle)).atexit = False
 
 
-def is_current(runtime: Runtime) -> bool:
-    """Return True if a runtime is still active.
-
-    Raises:
-        RuntimeError: If this process was forked from the one that started it.
-    """
+def require_current(runtime: Runtime) -> None:
+    """Raise RuntimeError if a runtime is no longer active, or this process was forked from the one that
+    started it: access to the memory of its simulators would crash."""
     _refuse_fork()
-    return runtime is _current
+    if runtime is not _current:
+        raise RuntimeError(
+            "this simulator is invalid: Taichi was restarted with another device, precision or "
+            "number of threads; build the simulator again"
+        )

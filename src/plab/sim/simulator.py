@@ -27,7 +27,7 @@ from plab.sim.compiler import ti
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
-from plab.sim.runtime import is_current, own_fields, register_user, start_runtime
+from plab.sim.runtime import own_fields, register_user, require_current, start_runtime
 from plab.sim.state import (
     Measures,
     Rollout,
@@ -116,7 +116,7 @@ class Simulator:
         Raises:
             SceneError: If a scene cannot be simulated or the scenes cannot share a simulator.
             DeviceError: If CUDA is not available.
-            ValueError: If device or precision are unknown.
+            ValueError: If device or precision are unknown, or terms belong to another simulator.
         """
         require_alike(scenes)
         self.scenes = tuple(scenes)
@@ -152,8 +152,8 @@ class Simulator:
         self._joints: Any = None
         self._initial_joints: np.ndarray | None = None
         self._start_from(self._start_positions(self.scenes, particles))
-        # Incremented by every change that affects the gradient of a rollout.
-        self._version = 0
+        # Incremented by every change that affects the gradient of a rollout, and its value at the last one.
+        self._version, self._differentiated = 0, -1
         self.changes = 0
         self.set_contact("soft")
         self.set_weights({term.name: term.weight for term in self.terms})
@@ -162,6 +162,7 @@ class Simulator:
     def memory_bytes(self) -> int:
         """Memory of all fields and arrays of the simulator on its device [bytes], without Taichi itself,
         compiled kernels and transfers to or from the host."""
+        self._require_runtime()
         engine = self._engine
         return held_bytes(self, engine, *engine.terms, self._particles, self._tape)
 
@@ -251,9 +252,13 @@ class Simulator:
         Raises:
             SceneError: If a scene cannot be simulated with these values, or values per body are given for a
                 single material; nothing is changed in these cases.
+            ValueError: If there are more values than parameters.
         """
         self._require_runtime()
-        given = {**dict(zip(self.material_keys, values, strict=False)), **named}
+        keys = self.material_keys
+        if len(values) > len(keys):
+            raise ArgumentError(f"{len(values)} values for {len(keys)} parameters, {', '.join(keys)}")
+        given = {**dict(zip(keys, values, strict=False)), **named}
         scenes = with_material(self.scenes, {key: value for key, value in given.items() if value is not None})
         for scene in scenes:
             scene.validate()
@@ -333,14 +338,12 @@ class Simulator:
                 kept = np.array(self.impulses()) * (chosen == 0)[:, None, None]
                 copy_numbers(self._impulses, 0, kept.reshape(-1), kept.size, True)
             self._engine.copy_chosen(self._initial, self._particles.current, chosen)
-            self._particles.reset_order(environments)
-            poses = np.array(self.poses())
-            poses[chosen != 0] = self._initial_poses[chosen != 0]
+            self._particles.reset_order(np.flatnonzero(chosen).tolist())
+            rows = chosen[:, None] != 0
             if self._initial_joints is not None:
                 held = self._joints.cpu() if on_device(self._joints) else self._joints
-                self._joints = np.array(held)
-                self._joints[chosen != 0] = self._initial_joints[chosen != 0]
-            self._place(poses)
+                self._joints = np.where(rows, self._initial_joints, held)
+            self._place(np.where(rows[:, None], self._initial_poses, self.poses()))
             return
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
         self._particles.reset_order()
@@ -508,11 +511,10 @@ class Simulator:
         self._require_runtime()
         tails = {"x": (3,), "v": (3,), "C": (3, 3), "F": (3, 3)}
         expected = {name: (self.batch, self.particle_count, *tail) for name, tail in tails.items()}
-        joints = () if self._initial_joints is None else self._initial_joints
-        expected |= {"poses": self._initial_poses.shape, "joints": np.shape(joints)}
+        expected |= {"poses": self._initial_poses.shape, "joints": getattr(self._initial_joints, "shape", ())}
         for name, shape in expected.items():
             value = getattr(state, name)
-            if np.shape(() if value is None else value) != shape:
+            if np.shape(value) != shape:
                 raise ArgumentError(f"{name} has shape {np.shape(value)}, not {shape}")
         checked_positions(state.x, self.scenes[0])
         entries = dict.fromkeys(("v", "C", "F"), "particle") | {"poses": "manipulator", "joints": "joint"}
@@ -531,7 +533,7 @@ class Simulator:
         self._require_runtime()
         order = self._particles.initial
         state = self._particles.unpack(to_host(self._initial), self._initial_poses.copy(), order)
-        return replace(state, joints=self._initial_joints)
+        return replace(state, joints=None if self._initial_joints is None else self._initial_joints.copy())
 
     def set_initial_state(self, state: State) -> None:
         """Replace the initial state of :meth:`reset` and :meth:`rollout`; shapes as in :class:`State`."""
@@ -563,7 +565,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         if gradient and not self.terms:
-            raise ArgumentError("there is no loss to differentiate: pass terms to Simulator")
+            raise ArgumentError("there is no loss to differentiate: pass terms with weights to Simulator")
         array, steps, poses, plan = self._started(actions, gradient)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
@@ -571,13 +573,14 @@ class Simulator:
         actions_bar, failures = None, dict[int, str]()
         if gradient:
             bars = self._tape.backward(terms, self.steps_before_contact(steps))
+            self._differentiated = self._version
             actions_bar = self._by_actions(bars, steps, actions, self._drive)
             failures = broken_gradients(actions_bar)
+        self._end_at(poses, steps)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), actions)
         failures |= broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
             require_none(failures)
-        self._engine.place(poses, steps, self._pose, 0)
         judged = self._judged(values)
         step_terms, step_iou = judged.terms[1:].swapaxes(0, 1), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
@@ -647,7 +650,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         if not self.terms:
-            raise ArgumentError("there is no loss to differentiate: pass terms to Simulator")
+            raise ArgumentError("there is no loss to differentiate: pass terms with weights to Simulator")
         poses = self._pose_history(steps, np.asarray(self.poses()))
         engine, particles, tape = self._engine, self._particles, self._tape
         row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
@@ -662,6 +665,8 @@ class Simulator:
         def observe(last: int, state: ti.Ndarray, slot: int) -> None:
             """Observe the state after step ``last``, and choose the actions of the next one."""
             t = last + 1
+            # Before the policy returns NaN for the observations of a diverged environment.
+            require_none(broken_states(engine.read(engine.fault), engine.substeps, self._taken + 1))
             numbers.append(particles.noted_order())
             posed = numbers_of(poses, posed_shape, like, first=t * int(np.prod(posed_shape)))
             chosen = choose(t, self._observe(state, slot, stride, like), posed)
@@ -712,13 +717,12 @@ class Simulator:
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * engine.batch * engine.measures)
         observe(-1, particles.current, 0)
         tape.forward(actions, poses, None, steps, plan, after=observe)
-        require_none(broken_states(engine.read(engine.fault), engine.substeps))
         with self._kept_weights() as weights:
             tape.backward(terms, self.steps_before_contact(steps), add, actions_bar)
         bars = numbers_of(actions_bar, (steps, engine.batch, engine.actions_per_step), like)
         require_none(broken_gradients(bars.swapaxes(0, 1)))
         react_at(0)
-        engine.place(poses, steps, self._pose, 0)
+        self._end_at(poses, steps)
         values = numbers_of(terms, (steps + 1, engine.batch, engine.measures), like)
         return self._judged(values).terms[1:].swapaxes(0, 1)
 
@@ -727,10 +731,11 @@ class Simulator:
 
         The backward pass computes it; this method copies it from the device. Gradients with respect to
         quaternions are those of the rotation matrix as a polynomial; project them onto the tangent space.
+        Poses of static manipulators, and rotations of shapes that cannot turn, have the gradient 0.
 
         Raises:
-            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no rollout
-                with a gradient.
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or has been used or
+                changed since a rollout with a gradient.
         """
         self._require_gradient()
         assert self._tape.bar is not None
@@ -745,8 +750,7 @@ class Simulator:
             own materials, shape [batch, body, parameter], 0 for parameters that a body's law does not have.
 
         Raises:
-            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
-                rollout with a gradient.
+            RuntimeError: As for :meth:`state_gradient`.
         """
         self._require_gradient()
         materials, keys = self._engine.materials, self.material_keys
@@ -769,8 +773,7 @@ class Simulator:
             derivatives differ; while a node sticks they are 0.
 
         Raises:
-            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
-                rollout with a gradient.
+            RuntimeError: As for :meth:`state_gradient`.
         """
         self._require_gradient()
         bar = self._engine.world_bar.to_numpy()
@@ -785,11 +788,14 @@ class Simulator:
         """
         self._require_runtime()
         self._engine.allocate_adjoint()
-        bar = self._particles.array(1)
+        # The rollout's gradient is kept.
+        bar, kept = self._particles.array(1), self._engine.pose_bar.to_numpy()
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)
-        return self._adjoint(bar)
+        gradient = self._adjoint(bar)
+        self._engine.pose_bar.from_numpy(kept)
+        return gradient
 
     def steps_before_contact(self, steps: int) -> int:
         """Return how many of the last rollout's ``steps`` precede the first contact in any environment; 0 if
@@ -885,6 +891,11 @@ class Simulator:
         with np.errstate(over="ignore"):
             return np.asarray(values, self.precision)
 
+    def _end_at(self, poses: ti.Ndarray, steps: int) -> None:
+        """Place the manipulators at the end of ``steps`` simulated steps, given the pose history."""
+        self._engine.place(poses, steps, self._pose, 0)
+        self._taken += steps
+
     def _place(self, poses: np.ndarray) -> None:
         """Place the manipulators at the start of an episode and clear failures."""
         if self.manipulator_count:
@@ -893,11 +904,7 @@ class Simulator:
         self._taken = 0
 
     def _require_runtime(self) -> None:
-        if not is_current(self._runtime):
-            raise RuntimeError(
-                "this simulator is invalid: Taichi was restarted with another device, precision or "
-                "number of threads; build the simulator again"
-            )
+        require_current(self._runtime)
 
     @contextmanager
     def _kept_weights(self) -> Iterator[np.ndarray]:
@@ -919,5 +926,8 @@ class Simulator:
         self._require_runtime()
         if not self._engine.full_gradient:
             raise RuntimeError("build the simulator with full_gradient=True for this gradient")
-        if self._tape.bar is None:
-            raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
+        if self._differentiated != self._version:
+            raise RuntimeError(
+                "there is no gradient of the last simulation: call rollout(actions, gradient=True), and read "
+                "its gradients before the next simulation or change"
+            )

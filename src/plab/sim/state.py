@@ -93,7 +93,7 @@ def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int =
 
 
 def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
-    """Return the environments with non-finite measures, shape [T + 1, batch, 6], and the step of each."""
+    """Return the environments with non-finite measures, shape [T + 1, batch, measure], and their steps."""
     broken = _is_broken(values)
     first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
     when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}

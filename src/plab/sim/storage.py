@@ -25,7 +25,7 @@ from plab.laws.algebra import Series
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim.codegen.bitcode import bitcode_file
 from plab.sim.compiler import ti
-from plab.sim.runtime import Runtime, copy_memory, own_fields
+from plab.sim.runtime import Runtime, copy_memory, own_fields, require_current
 from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.tensors import NUMPY_TYPES, Array
 
@@ -114,7 +114,7 @@ class Storage:
         self.full_gradient = full_gradient
         self.deterministic = deterministic
         first = scenes[0]
-        self.device = runtime.device
+        self.runtime, self.device = runtime, runtime.device
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
         self.batch = len(scenes)
@@ -321,12 +321,14 @@ class Storage:
 
     def read(self, field: ti.Field) -> np.ndarray:
         """Return all entries of a shared field of numbers."""
+        require_current(self.runtime)
         out = np.zeros(field.shape, NUMPY_TYPES[field.dtype])
         copy_memory(self._address_of(field), out, False)
         return out.astype(np.float64)
 
     def write(self, field: ti.Field, values: ArrayLike) -> None:
         """Write all entries of a shared field, given numbers with the field's leading shape."""
+        require_current(self.runtime)
         with np.errstate(over="ignore"):
             numbers = np.ascontiguousarray(values, NUMPY_TYPES[field.dtype])
         assert numbers.size == math.prod(field.shape) * getattr(field, "n", 1)

@@ -40,9 +40,8 @@ class Tape:
         self._history: list[ti.Ndarray] = []
         self._checkpoints: ti.Ndarray | None = None
         self._moves: ti.Ndarray | None = None
-        # Environment steps per segment, and per array of the history.
-        self._length = 0
-        self._reach = 0
+        # Environment steps per segment, and per array of the history; segment that the history holds.
+        self._length = self._reach = self._held = 0
         self._plans: dict[tuple[int, float], int] = {}
         self.bar: ti.Ndarray | None = None
         self._spare_bar: ti.Ndarray | None = None
@@ -150,7 +149,7 @@ class Tape:
         if length is not None:
             self._reach = min(length, self._reach_max)
             self._allocate(steps)
-        last = (steps - 1) // self._length if length is not None else -1
+        self._held = last = (steps - 1) // self._length if length is not None else -1
         for t in range(steps):
             k, begins = t // self._length, t % self._length == 0
             if begins and length is not None and steps > length:
@@ -214,12 +213,13 @@ class Tape:
         # Allocated in the forward pass.
         assert self.bar is not None
         engine.clear_adjoint(self.bar)
-        last = (steps - 1) // self._length
         for t in reversed(range(steps)):
             k = t // self._length
-            if k < last and (t + 1) % self._length == 0:
+            # The last segment is recomputed, too, after an earlier backward pass.
+            if k != self._held:
+                self._held = k
                 self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
-                for again in range(k * self._length, (k + 1) * self._length):
+                for again in range(k * self._length, t + 1):
                     self._keep_step(again, known=True)
             history, slot = self._place(t)
             if add is not None:
@@ -260,8 +260,7 @@ class RecordedStates:
         self._first = first = 0 if every_step else steps - 1
         # Particle numbers of each state, if particles are sorted.
         self._numbers: list[ti.Ndarray] = []
-        rows: list[Any] = []
-        masses: list[Any] = []
+        rows, masses = list[Any](), list[Any]()
 
         def note(t: int, state: ti.Ndarray, slot: int) -> None:
             if t < first:
@@ -276,8 +275,8 @@ class RecordedStates:
             return torch.stack(parts, 1) if on_device(actions) else np.stack(parts, 1)
 
         simulator._tape.forward(array, history, None, steps, plan, after=note)
+        simulator._end_at(history, steps)
         require_none(broken_states(engine.read(engine.fault), engine.substeps))
-        engine.place(history, steps, simulator._pose, 0)
         poses = numbers_of(history, (steps + 1, engine.batch, engine.manipulators, 8), actions)
         moved = stacked(rows)
         self.x, self.v, self.mass = moved[..., :3], moved[..., 3:], stacked(masses) if with_mass else None
@@ -319,6 +318,7 @@ class RecordedStates:
                 )
             by_step[name] = [flat(part) for part in bar.swapaxes(0, 1)]
         simulator, engine = self._simulator, self._simulator._engine
+        simulator._require_runtime()
         if not self._gradient or simulator._version != self._version:
             raise RuntimeError(
                 "there is no gradient: record with gradient=True, and pull back before the next simulation"
@@ -342,6 +342,9 @@ class RecordedStates:
         with simulator._kept_weights():
             engine.write(engine.term_weights, np.zeros(engine.term_weights.shape))
             by_motions = simulator._tape.backward(terms, simulator.steps_before_contact(steps), add)
+        # The backward pass ends with the poses of the first step, but losses are those of the last state.
+        simulator._end_at(simulator._pose, 0)
+        simulator._differentiated = simulator._version
         gradient = simulator._by_actions(by_motions, steps, self._like, self._drive)
         require_none(broken_gradients(gradient))
         return gradient

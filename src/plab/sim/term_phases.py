@@ -12,6 +12,7 @@ particles near a lower face have negative weights, and nodes may have negative m
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from plab.errors import ArgumentError
 from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.compiler import ti
 from plab.sim.motion import quaternion, rotation_matrix, rotation_matrix_adjoint, vec8
@@ -68,6 +69,8 @@ class TermPhases(Storage):
         self.accumulator_part = ti.Vector.field(2, ti.f64, shape=(accumulators, self.batch, self.shares, m))
         self.accumulator = ti.Vector.field(2, ti.f64, shape=(accumulators, self.batch, m))
         for term in self.terms:
+            if hasattr(term, "sim"):
+                raise ArgumentError(f"term '{term.name}' belongs to another simulator: make terms for each")
             term.attach(self)
 
     def _with(self, hook: str) -> tuple[tuple[int, int, Any], ...]:
