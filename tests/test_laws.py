@@ -15,7 +15,7 @@ from pages import ROOT, blocks
 from plab.config import ConfigError, build_scene, load_config
 from plab.laws import Law, viscoplastic
 from plab.laws.algebra import Series
-from plab.scenes import LAWS, Body, Material, Scene, find_law
+from plab.scenes import LAWS, Body, Material, Scene, SceneError, find_law
 from plab.sim import DeviceError, Simulator
 from plab.sim.codegen import bitcode
 from plab.sim.compiler import ti
@@ -323,9 +323,7 @@ def test_compiled_laws_are_kept_in_the_cache(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "cache"))
     given = ("cpu", "f32", LAWS["elastic"])
     path = Path(bitcode.bitcode_file.__wrapped__(*given))
-    assert path.parent == tmp_path / "cache" / "laws" and [p.name for p in path.parent.iterdir()] == [
-        path.name
-    ]
+    assert path.parent == tmp_path / "cache" / "laws" and list(path.parent.iterdir()) == [path]
     time = path.stat().st_mtime_ns
     assert bitcode.bitcode_file.__wrapped__(*given) == str(path) and path.stat().st_mtime_ns == time
     # Without a cache, a folder of the process serves; without llvmlite, one line says so.
@@ -340,18 +338,20 @@ def test_compiled_laws_are_kept_in_the_cache(monkeypatch, tmp_path) -> None:
     line = "{0} = replace(ELASTIC, name='{0}', update=lambda c, f, *_: ([{1}] * 6, f))\n"
     text = "from dataclasses import replace\nimport numpy as np\nfrom plab.laws.elastic import ELASTIC\n"
     text += line.format("A", "1.0 if c[0] < 0.0 else 2.0") + line.format("B", "np.arctan(c[0])")
+    text += line.format("C", "0.0, c[0]") + "D = replace(ELASTIC, stiffness=float)\n"
     (tmp_path / "wrong.py").write_text(text)
     for law, kind, named in (
         ("wrong:A", ConfigError, r"law A of \S+wrong.py cannot .* use np.where"),
         ("wrong:B", ConfigError, "np.arctan of a component"),
+        ("wrong:C", ConfigError, "6 stresses and 9 numbers of F, not 12 and 9"),
+        ("wrong:D", SceneError, "law wrong:D: coefficients, stiffness or viscosity fail: float expected"),
         ("elastic", DeviceError, "compiles its laws with llvmlite"),
     ):
         if law == "elastic":
             monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+        bodies = (Body("sphere", (0.5,) * 3, (0.1,), 9, law=law),)
         with pytest.raises(kind, match=named):
-            Simulator(
-                [Scene("one", (Body("sphere", (0.5,) * 3, (0.1,), 9, law=law),), ())], precision="float64"
-            )
+            Simulator([Scene("one", bodies, ())], precision="float64")
 
 
 def test_many_threads_add_to_numbers_of_a_field() -> None:

@@ -108,7 +108,11 @@ class Material:
 
     def largest_step(self, dx: float) -> float:
         """Return the largest stable time step [s] on a grid of spacing dx."""
-        return self.kind.largest_step(self.values, dx)
+        try:
+            return self.kind.largest_step(self.values, dx)
+        except Exception as error:
+            # A law of the user may raise anything.
+            raise SceneError(f"law {self.law}: coefficients, stiffness or viscosity fail: {error}") from error
 
     def validate(self, label: str = "") -> None:
         """Raise SceneError, with a message that begins with ``label``, if a value is out of range."""

@@ -24,19 +24,19 @@ NORM_SHIFT = 1e-16
 """Added to the squared norm of the deviator, because the derivative of the root is infinite at 0."""
 
 
-def hencky(frame):
-    """Trace and deviator (3) of the principal Hencky strains."""
+def hencky(c, f, dt):
+    """Trial F, principal frame, and trace, deviator (3) and its norm of the principal Hencky strains."""
+    g = trial_gradient(c, f, dt)
+    frame = PrincipalFrame(outer_sym(g))
     strain = [0.5 * np.log(np.maximum(value, SQUARE_MIN)) for value in frame.values]
     trace = total(strain)
-    return trace, [e - trace * (1.0 / 3.0) for e in strain]
+    deviator = [e - trace * (1.0 / 3.0) for e in strain]
+    return g, frame, trace, deviator, np.sqrt(total(e * e for e in deviator) + NORM_SHIFT)
 
 
 def update(c, f, dt, mu, lam, alpha):
     """Return the Kirchhoff stress, and F after the substep."""
-    g = trial_gradient(c, f, dt)
-    frame = PrincipalFrame(outer_sym(g))
-    trace, deviator = hencky(frame)
-    norm = np.sqrt(total(e * e for e in deviator) + NORM_SHIFT)
+    g, frame, trace, deviator, norm = hencky(c, f, dt)
     pressed = np.minimum(trace, 0.0)
     k = np.minimum(-(1.5 * lam / mu + 1.0) * alpha * pressed / norm, 1.0)
     pressure = (lam + (2.0 / 3.0) * mu) * pressed

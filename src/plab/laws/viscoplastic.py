@@ -8,11 +8,10 @@ import math
 
 import numpy as np
 
-from plab.laws.algebra import mul_sym_mat, outer_sym, total, trial_gradient
-from plab.laws.drucker_prager import NORM_SHIFT, hencky
+from plab.laws.algebra import mul_sym_mat
+from plab.laws.drucker_prager import hencky
 from plab.laws.elastic import ELASTIC, lame
 from plab.laws.law import Law, Parameter
-from plab.laws.principal import PrincipalFrame
 from plab.laws.tracing import Node, frozen
 
 HALLEY_STEPS = 3
@@ -24,10 +23,7 @@ LEAST = 1e-12
 
 def update(c, f, dt, mu, lam, yield_stress, log_consistency, power):
     """Return the Kirchhoff stress, and F after the substep."""
-    g = trial_gradient(c, f, dt)
-    frame = PrincipalFrame(outer_sym(g))
-    trace, deviator = hencky(frame)
-    norm = np.sqrt(total(e * e for e in deviator) + NORM_SHIFT)
+    g, frame, trace, deviator, norm = hencky(c, f, dt)
     over = np.maximum(2.0 * mu * norm - yield_stress, 0.0)
     k = 1.0 - (over - overstress(over, dt, mu, log_consistency, power)) / (2.0 * mu * norm)
     pressure = (lam + (2.0 / 3.0) * mu) * trace

@@ -312,10 +312,8 @@ class RecordedStates:
             if bar is None:
                 continue
             bar, shape = bar if on_device(bar) else np.asarray(bar), np.shape(getattr(self, name))
-            if np.shape(bar) != shape:
-                raise ArgumentError(
-                    f"derivatives with respect to {name} have shape {np.shape(bar)}, not {shape}"
-                )
+            if (given := np.shape(bar)) != shape:
+                raise ArgumentError(f"derivatives with respect to {name} have shape {given}, not {shape}")
             by_step[name] = [flat(part) for part in bar.swapaxes(0, 1)]
         simulator, engine = self._simulator, self._simulator._engine
         simulator._require_runtime()

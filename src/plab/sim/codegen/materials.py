@@ -264,6 +264,8 @@ def update(law: Law, keep: bool, one: Tile | Particle) -> None:
     c, f = one.take("c"), one.take("f")
     dt, scale, mass = (one.number(key) for key in CONSTANTS.split())
     tau, f_new = law.update(c, f, dt, *one.take("p"))
+    if (len(tau), len(f_new)) != (6, 9):
+        raise TypeError(f"update must return 6 stresses and 9 numbers of F, not {len(tau)} and {len(f_new)}")
     one.leave("a", scattered_matrix(tau, c, scale, mass))
     if keep:
         one.leave("f_new", f_new)
