@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that enables tracebacks of bugs."""
@@ -70,11 +72,17 @@ def out_of_memory(error: MemoryError) -> str:
     return str(error) or "out of memory: close other programs, or use fewer particles or environments"
 
 
-def describe_bug(error: Exception) -> str:
-    """Describe an unexpected error with its last place in plab or the user's files, not in a library."""
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [one for one in frames if not one.filename.startswith((sys.prefix, sys.base_prefix))] or frames
-    return f"{type(error).__name__} in {own[-1].filename}, line {own[-1].lineno}: {error}"
+def describe_error(error: Exception) -> tuple[str, bool]:
+    """Describe an unexpected error by its last place in plab or the user's files; return whether it is plab's, too."""
+    frames = [(one.filename, one.lineno) for one in traceback.extract_tb(error.__traceback__)]
+    # Taichi's messages list the compiled functions down to the cause.
+    frames += re.findall(r'File "(.+)", line (\d+), in', str(error))
+    plab, libraries = str(Path(__file__).parent), (sys.prefix, sys.base_prefix)
+    own = [one for one in frames if one[0].startswith(plab) or not one[0].startswith(libraries)] or frames
+    file, line = own[-1]
+    reason = str(error).strip().rpartition("\n")[2]
+    is_bug = file.startswith((plab, *libraries))
+    return f"{type(error).__name__} in {file}, line {line}: {reason}", is_bug
 
 
 def traceback_wanted() -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from plab.errors import ConfigError, describe_bug, suggest
+from plab.errors import ConfigError, describe_error, suggest
 
 Kind = TypeVar("Kind")
 
@@ -109,4 +109,4 @@ def _imported(text: str, name: str) -> ModuleType:
     except SyntaxError as error:
         raise ConfigError(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
     except Exception as error:
-        raise ConfigError(f"'{text}': {describe_bug(error)}") from error
+        raise ConfigError(f"'{text}': {describe_error(error)[0]}") from error

@@ -24,7 +24,7 @@ from plab.errors import (
     TRACEBACK,
     ArgumentError,
     PlabError,
-    describe_bug,
+    describe_error,
     out_of_memory,
     print_error,
     printable,
@@ -83,8 +83,11 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         except Exception as error:
             if traceback_wanted():
                 raise
-            print_error(f"a bug: {describe_bug(error)}; report plab's with the output of {TRACEBACK}=1")
-            return EXIT_BUG
+            what, is_bug = describe_error(error)
+            if is_bug:
+                print_error(f"a bug: {what}; please report it with the output of {TRACEBACK}=1")
+                return EXIT_BUG
+            print_error(f"{what}; {TRACEBACK}=1 prints the traceback")
         return PlabError.exit_code
 
     return answered

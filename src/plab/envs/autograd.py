@@ -151,8 +151,7 @@ class _States(torch.autograd.Function):
         ctx.simulator, ctx.recording = simulator, recording
         ctx.likes = actions, material, *initial
         ctx.set_materialize_grads(False)
-        taken = recording.mass if mass else np.zeros(0)
-        shown = recording.x, recording.v, recording.poses, taken
+        shown = recording.x, recording.v, recording.poses, recording.mass if mass else np.zeros(0)
         return tuple(torch.as_tensor(part).to(actions, copy=True) for part in shown)
 
     @staticmethod

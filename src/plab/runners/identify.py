@@ -147,8 +147,6 @@ class IdentifyRunner(Runner):
 
     def step(self, track: Track) -> Step:
         """Simulate the trial and its perturbations, accept it if it fits better, and compute the next one."""
-        from plab.sim.batch import require_alike
-
         method, state = self.method, self._state
         scenes, count = self._scenes(state["trial"]), len(method.parameters)
         seen, measured = self._simulate(scenes)
@@ -167,7 +165,8 @@ class IdentifyRunner(Runner):
         way /= max(1.0, np.abs(way).max() / np.log(2.0))
         while True:
             with contextlib.suppress(SceneError):
-                require_alike(self._scenes(state["best"] + way))
+                for scene in self._scenes(state["best"] + way):
+                    scene.validate()
                 break
             way *= 0.5
         state["trial"] = state["best"] + way

@@ -56,9 +56,8 @@ class CameraSensor:
         self.width, self.height = camera.size
         self.pixels = self.width * self.height
         self._keys = ti.ndarray(ti.i64, shape=self.batch * self.pixels)
-        axes = camera.axes()
         self._frame = ti.ndarray(ti.f32, shape=12)
-        self._frame.from_numpy(np.concatenate([camera.position, axes.reshape(-1)]).astype(np.float32))
+        self._frame.from_numpy(np.concatenate([camera.position, *camera.axes()]).astype(np.float32))
         self._balls = ti.ndarray(ti.f32, shape=self.batch * self.particles)
         self._labels = ti.ndarray(ti.i32, shape=self.batch * self.particles)
         self.refresh()

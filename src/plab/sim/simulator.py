@@ -163,8 +163,7 @@ class Simulator:
         """Memory of all fields and arrays of the simulator on its device [bytes], without Taichi itself,
         compiled kernels and transfers to or from the host."""
         self._require_runtime()
-        engine = self._engine
-        return held_bytes(self, engine, *engine.terms, self._particles, self._tape)
+        return held_bytes(self, self._engine, *self._engine.terms, self._particles, self._tape)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Raise TypeError: simulators cannot be copied or pickled."""
@@ -784,11 +783,10 @@ class Simulator:
         """Return the gradient of the weighted loss of the current state with respect to that state, without
         simulation.
 
-        Gradients with respect to quaternions are as in :meth:`state_gradient`.
+        Gradients with respect to quaternions are as in :meth:`state_gradient`, whose result remains valid.
         """
         self._require_runtime()
         self._engine.allocate_adjoint()
-        # The rollout's gradient is kept.
         bar, kept = self._particles.array(1), self._engine.pose_bar.to_numpy()
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
