@@ -55,8 +55,7 @@ def test_ranges_are_respected_and_used(name: str) -> None:
     # Scripted targets get a seed that no variant has.
     if "seed" in task.target:
         seeds = [t["target"]["seed"] for t in tasks]
-        assert len(set(seeds)) == SCENES
-        assert FIRST_TARGET_SEED <= min(seeds) and max(seeds) < 2**31
+        assert len(set(seeds)) == SCENES and FIRST_TARGET_SEED <= min(seeds) and max(seeds) < 2**31
         assert all(variant.target.seed < FIRST_TARGET_SEED for variant in task.variants.values())
 
 

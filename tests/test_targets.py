@@ -88,8 +88,7 @@ def test_bodies_share_the_particles_by_volume(rope):
     scene = replace(rope, bodies=(replace(rope.bodies[0], particles=1001),))
     small = CUBE | {"center": [0.8, 0.2, 0.5], "size": [0.1, 0.1, 0.1]}
     x = samples(scene, {"recipe": "bodies", "bodies": {"large": CUBE, "small": small}})
-    assert len(x) == 1001
-    assert np.sum(x[:, 0] > 0.6) == round(1001 / 9)
+    assert len(x) == 1001 and np.sum(x[:, 0] > 0.6) == round(1001 / 9)
     assert np.all(np.abs(x[x[:, 0] < 0.6] - CUBE["center"]) <= 0.1)
     # A target where the scene's body is has another draw.
     body = rope.bodies[0]

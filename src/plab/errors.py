@@ -73,7 +73,7 @@ def out_of_memory(error: MemoryError) -> str:
 
 
 def describe_error(error: Exception) -> tuple[str, bool]:
-    """Describe an unexpected error by its last place in plab or the user's files; return whether it is plab's, too."""
+    """Describe an unexpected error by its last place in plab or the user's files, and tell if it is a bug."""
     frames = [(one.filename, one.lineno) for one in traceback.extract_tb(error.__traceback__)]
     # Taichi's messages list the compiled functions down to the cause.
     frames += re.findall(r'File "(.+)", line (\d+), in', str(error))
