@@ -179,8 +179,7 @@ def test_a_killed_process_holds_nothing() -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout.readline() == "ready\n"
-    assert held("run.h5") and acquire("run.h5") is None
+    assert process.stdout.readline() == "ready\n" and held("run.h5") and acquire("run.h5") is None
     process.kill()
     process.communicate()
     assert lock_path("run.h5").exists() and not held("run.h5")

@@ -22,7 +22,7 @@ import numpy as np
 
 from plab.config import Config, ConfigError
 from plab.config.families import SOLVED, family
-from plab.errors import TRACEBACK, PlabError, out_of_memory, print_error, traceback_wanted
+from plab.errors import TRACEBACK, PlabError, describe_error, out_of_memory, print_error, traceback_wanted
 from plab.objective import chamfer_distance, earth_movers_distance
 from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import BUDGETS, ResultsError, RunFile, row_count
@@ -54,7 +54,12 @@ def _is_refusal(error: Exception) -> bool:
 
 
 def _describe(error: Exception) -> str:
-    return str(error) if isinstance(error, PlabError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, PlabError):
+        return str(error)
+    if isinstance(error, OSError | MemoryError):
+        return f"{type(error).__name__}: {error}"
+    what, is_bug = describe_error(error)
+    return f"a bug: {what}" if is_bug else what
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ class Track:
             return Outcome.of(self.cfg, status, self.run.result.score)
         what = _describe(error)
         if not (isinstance(error, PlabError) or traceback_wanted()):
-            what += f"; a bug: {TRACEBACK}=1 shows where"
+            what += f"; {TRACEBACK}=1 prints the traceback"
         return Outcome.of(self.cfg, "refused" if _is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
