@@ -163,16 +163,19 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path) -> None:
 
 
 def test_rounds_take_the_drawn_scenes_in_turn() -> None:
-    cfg = make_config("results", "pods", "method.epochs=1")
+    words = "results", "pods", "method.epochs=1", "+task.randomize.yield_stress=[20,200]"
+    cfg = make_config(*words)
     batch, _ = environments(cfg)
-    training, taken = prepared(cfg), []
+    training, taken, sampled = prepared(cfg), [], []
     for _ in range(3):
         training.cycle()
         taken.append([one.seed_scene for one in batch.configs])
+        sampled += [one.materials[0].yield_stress for one in batch.problem.scenes]
+    assert len(set(sampled)) == 9
     assert taken == [[1000, 1001, 1002], [1003, 1004, 1000], [1001, 1002, 1003]]
     # Whoever shares the environments next has those it asks for.
     for variant in "1", "3":
-        wanted = make_config("results", "pods", "method.epochs=1", f"variant={variant}")
+        wanted = make_config(*words, f"variant={variant}")
         again, _ = environments(wanted)
         assert again is batch and [one.variant for one in batch.configs] == [variant] * ENVS
         assert batch.problem.scenes[1] == build_scene(wanted)

@@ -215,8 +215,7 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
     for name, words in names.items():
         cfg = load_config(words)
         configuration = configuration_of(cfg)
-        assert configuration.name == name
-        assert checksum(configuration.config()) == checksum(cfg)
+        assert configuration.name == name and checksum(configuration.config()) == checksum(cfg)
     drawn = load_config(["task=Move", "variant=random", "seed_scene=3"])
     assert "Move-vrandom3" in why(configuration_of, drawn)
     for word in ("protocol.floor=release", "targets.source=there", "task.name=Mine"):

@@ -20,6 +20,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
@@ -97,7 +99,9 @@ class PodsRunner(ImitationRunner):
 
         env, observed, taken, total = TensorEnv(self.batch), [], [], 0.0
         # All episodes of a round use the samples of the round.
-        seen = env.reset(episode=self.episodes // (self.round_episodes[0] * self.batch.size))
+        size = self.batch.size
+        turn = self.episodes // (self.round_episodes[0] * size)
+        seen = env.reset(episode=turn * size + np.arange(size))
         for t in range(self._horizon):
             with torch.no_grad():
                 chosen = self.network(self.scaled(seen)) if actions is None else actions[:, t]
