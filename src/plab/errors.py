@@ -73,11 +73,12 @@ def out_of_memory(error: MemoryError) -> str:
 
 
 def describe_error(error: Exception) -> tuple[str, bool]:
-    """Describe an unexpected error by its last place in plab or the user's files, and tell if it is a bug."""
+    """Return a line that names an unexpected error's last place in plab or the user's files, and whether it
+    is a bug, that is, not in the user's files."""
     frames = [(one.filename, one.lineno) for one in traceback.extract_tb(error.__traceback__)]
     # Taichi's messages list the compiled functions down to the cause.
     frames += re.findall(r'File "(.+)", line (\d+), in', str(error))
-    plab, libraries = str(Path(__file__).parent), (sys.prefix, sys.base_prefix)
+    plab, libraries = f"{Path(__file__).parent}{os.sep}", (sys.prefix, sys.base_prefix)
     own = [one for one in frames if one[0].startswith(plab) or not one[0].startswith(libraries)] or frames
     file, line = own[-1]
     reason = str(error).strip().rpartition("\n")[2]

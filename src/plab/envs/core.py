@@ -380,7 +380,8 @@ class EpisodeBatch:
             like: If a CUDA tensor, results are CUDA tensors.
             environments: Numbers or mask of the sub-environments to reset; default: all.
             seeds: Seeds of these environments, which restart their random sequences; default: continue.
-            episode: Number of the episode, or of each, which determines the samples; default: the next.
+            episode: Number of the episode, or of each environment's, shape [environment], which determines
+                the samples; default: the next.
             options: Values by dotted key of the task that replace samples, for all of these sub-environments
                 or, with a first axis of the batch's length, one for each.
 
