@@ -90,11 +90,7 @@ def test_an_experiment_is_a_sweep(seen, mode):
         (KeyboardInterrupt(), 130, "stopped"),
         (KeyError("a bug"), 70, "KeyError"),
         (RecursionError("a bug"), 70, "RecursionError"),
-        (
-            OverflowError('File "/own.py", line 7, in f:\n^\nno m'),
-            2,
-            "Error in /own.py, line 7: no m; PLAB",
-        ),
+        (OverflowError('File "/own.py", line 7, in f:\n^\nno m'), 2, "Error in /own.py, line 7: no m; PLAB"),
     ],
     ids=repr,
 )

@@ -16,7 +16,7 @@ from unittest.mock import Mock
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import NameNotFound, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from omegaconf import OmegaConf
@@ -365,6 +365,8 @@ def test_configurations_of_a_batch() -> None:
 
 
 def test_environments_that_cannot_be_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(NameNotFound, match="did you mean Move"):
+        plab.make("Move-v1")
     with pytest.raises(ValueError, match="render_mode 'ansi'"):
         PlabEnv("Move", render_mode="ansi")
     own = [[], ["sim.horizon=3"]]

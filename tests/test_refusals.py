@@ -18,11 +18,11 @@ from plab.cli.rollouts import export, render, view
 from plab.cli.run import main
 from plab.cli.submissions import submit
 from plab.cli.suite import demonstrations, targets
-from plab.config import load_config
+from plab.config import build_scene, load_config
 from plab.config.compose import check_sources
 from plab.envs.sb3 import make_sb3
 from plab.errors import PlabError
-from plab.problem import Problem
+from plab.problem import Problem, make_simulator
 from plab.render import graphics
 from plab.results import load
 from plab.sim import Simulator
@@ -207,6 +207,8 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "a text of overrides": (lambda: load_config("task=Move"), "'task=Move'"),
     "half an environment": (lambda: make_sb3("plab/Rope-v1", num_envs=1.5), "num_envs"),
     "no configuration": (lambda: Problem([]), "configuration"),
+    "overrides for a simulator": (lambda: make_simulator(["task=Move"]), "plab.load_config"),
+    "overrides for a scene": (lambda: build_scene("task=Move"), "plab.load_config"),
     "a scene": (lambda: Simulator(scene(("Sphere",))), "Simulator([scene])"),
     "too many scenes": (lambda: Simulator([scene(("Sphere",))] * 3176), "at most 3175 together"),
     "too large a scene": (lambda: Simulator([scene((), particles=10**9)]), "324 GB"),

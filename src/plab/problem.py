@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene, drawn_configs
+from plab.config.compose import require_configs
 from plab.config.selection import OBSERVATION_KEYS, leaves
 from plab.losses import make_terms
 from plab.objective import (
@@ -120,8 +121,12 @@ def make_simulator(
         scenes: Scenes of the configurations, if already built.
         **options: Arguments of :class:`plab.sim.Simulator`, whose errors apply, that override the
             configuration's.
+
+    Raises:
+        ConfigError: If ``cfgs`` is something else, such as overrides.
     """
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
+    require_configs(cfgs)
     sim, method = cfgs[0].sim, cfgs[0].method
     keys = ("precision", "device", "memory_mb", "deterministic")
     settings: dict[str, Any] = {key: getattr(sim, key) for key in keys}

@@ -237,13 +237,20 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
 # ------------------------------------------------------------------------------------------ scene and devices
 
 
+def require_configs(cfgs: object) -> None:
+    """Raise ConfigError unless ``cfgs`` is a sequence of configurations."""
+    if not isinstance(cfgs, Sequence) or not all(isinstance(cfg, Config) for cfg in cfgs):
+        raise ConfigError("pass a configuration, such as plab.load_config(['task=Move', 'seed=3'])")
+
+
 def build_scene(cfg: Config) -> Scene:
     """Build and validate the scene of a configuration.
 
     Raises:
-        ConfigError: If the task is that of another variant.
+        ConfigError: If ``cfg`` is not a configuration, or its task is that of another variant.
         plab.scenes.SceneError: If the scene cannot be simulated.
     """
+    require_configs([cfg])
     task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
     if cfg.variant not in task.variants:
         advice = suggest(cfg.variant, list(task.variants))

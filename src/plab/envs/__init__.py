@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 
 from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS, suite_tasks
+from plab.errors import suggest
 
 __all__ = ["ENTRY_POINT", "make", "make_vec", "register_task"]
 
@@ -22,10 +23,12 @@ ENTRY_POINT = "plab.envs.single:PlabEnv"
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """Create an environment of the suite, such as ``make("Rope")``.
 
-    Other arguments are those of :class:`plab.envs.single.PlabEnv` and ``gymnasium.make``, which raises
-    ``gymnasium.error.Error`` if the task or the variant does not exist.
+    Other arguments are those of :class:`plab.envs.single.PlabEnv` and ``gymnasium.make``.
+
+    Raises:
+        gymnasium.error.NameNotFound: If the task or the variant is not registered.
     """
-    return gymnasium.make(f"plab/{task}-v{variant}", **kwargs)
+    return gymnasium.make(_env_id(task, variant), **kwargs)
 
 
 def make_vec(
@@ -33,9 +36,21 @@ def make_vec(
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """Create several environments of the suite that share one simulator.
 
-    Other arguments are those of :class:`plab.envs.vector.PlabVectorEnv` and of ``gymnasium.make_vec``.
+    Other arguments are those of :class:`plab.envs.vector.PlabVectorEnv` and of ``gymnasium.make_vec``; errors
+    are those of :func:`make`.
     """
-    return gymnasium.make_vec(f"plab/{task}-v{variant}", num_envs=num_envs, **kwargs)
+    return gymnasium.make_vec(_env_id(task, variant), num_envs=num_envs, **kwargs)
+
+
+def _env_id(task: str, variant: str | int) -> str:
+    env_id = f"plab/{task}-v{variant}"
+    if env_id not in gymnasium.registry:
+        ids = [name for name in gymnasium.registry if name.startswith("plab/")]
+        advice = suggest(task, sorted({name[len("plab/") :].rpartition("-v")[0] for name in ids}))
+        raise gymnasium.error.NameNotFound(
+            f"{env_id} is not registered: pass task and variant, such as make('Rope', 2); {advice}"
+        )
+    return env_id
 
 
 def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs: Any) -> None:

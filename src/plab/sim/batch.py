@@ -36,7 +36,10 @@ def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
     """Raise SceneError if scenes (and ``like``) cannot be simulated or cannot share a simulator."""
     if not isinstance(scenes, Sequence):
-        raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
+        raise SceneError(
+            "a simulator takes a list of scenes, one per environment: Simulator([scene]); "
+            "plab.make_simulator takes a Config"
+        )
     if not scenes:
         raise SceneError("a simulator needs at least one scene")
     first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
