@@ -74,6 +74,8 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
     ones = torch.ones(actions.shape, dtype=torch.int64)
     assert torch.equal(rollout(problem, ones), rollout(problem, ones.double()))
     assert simulate(problem.simulator, ones).x.dtype == torch.float64
+    compiled = torch.compile(lambda tried: rollout(problem, tried) + 0, backend="eager")
+    assert torch.equal(compiled(actions), rollout(problem, actions.detach().numpy()))
     with pytest.raises(TypeError, match="complex"):
         rollout(problem, ones.cfloat())
 
@@ -191,6 +193,9 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     episodes.reset()
     with pytest.raises(ValueError, match=r"\(4, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)
+    for policy, steps, named in ((lambda seen: seen, 1, "parameters="), (network(episodes, 6), 0, "steps")):
+        with pytest.raises(ValueError, match=named):
+            policy_gradient(episodes, policy, steps)
     broken = episodes.get_state()
     broken.simulation.v[1] = 1e9
     episodes.set_state(broken)

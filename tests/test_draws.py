@@ -27,7 +27,7 @@ from toy_runner import COARSE_32
 COARSE = [*COARSE_32, "sim.horizon=3", f"sim.device={DEVICE}"]
 NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
 RANGES = {
-    "yield_stress": [20.0, 200.0],
+    "yield_stress": np.array([20.0, 200.0]),
     "gravity": [[0.0, -33.0, 0.0], [0.0, -27.0, 0.0]],
     "floor_friction": [0.1, 1.0],
     "bodies": {"ball": {"offset": [[-0.02, 0.0, -0.02], [0.02, 0.02, 0.02]], "yaw": [-1.0, 1.0]}},
@@ -103,6 +103,10 @@ def test_seeds_and_options(vector) -> None:
     assert data_equivalence(one, three, exact=True)
     assert not any(np.array_equal(one[key], two[key]) for key in one if key[0] != "_")
     assert not np.array_equal(one["yield_stress"], drawn(seed=2)["yield_stress"])
+    assert data_equivalence(drawn(seed=np.int64(1)), drawn(seed=np.array([1, 2])), exact=True)
+    for seed in ([1], [None, 1], [1, -1], 1.5):
+        with pytest.raises(ValueError, match="seeds must be 2 whole"):
+            drawn(seed=seed)
     given = drawn(seed=1, options={"yield_stress": 50.0, "bodies.ball.yaw": np.array([0.5, 0.0])})
     assert given["yield_stress"].tolist() == [50, 50] and given["bodies.ball.yaw"].tolist() == [0.5, 0]
     assert np.array_equal(given["gravity"], one["gravity"])

@@ -27,7 +27,7 @@ from torch.utils._pytree import tree_leaves
 import plab
 import plab.envs.core as core
 import plab.sim.runtime as runtime
-from plab.config import Config, ConfigError, choices, plab_folder
+from plab.config import Config, ConfigError, choices, load_config, plab_folder
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
@@ -126,7 +126,7 @@ def test_an_episode_is_that_of_the_simulator_and_the_objective(env: PlabEnv) -> 
 
 def test_wrong_actions_and_options_are_refused(env: PlabEnv, vector: PlabVectorEnv) -> None:
     for action in (np.full(6, np.nan), [0, 0, 0, 0, 0, np.inf], np.zeros(5), np.zeros((1, 6)), None):
-        with pytest.raises(ValueError, match="actions"):
+        with pytest.raises(ValueError, match=r"actions contain|actions have the shape \(6,\), not"):
             env.step(action)
     vector.reset(options={"reset_mask": np.array([True, True])})
     for actions in (np.zeros(6), np.full((2, 6), np.nan)):
@@ -223,7 +223,7 @@ def test_a_reset_follows_changes_of_the_simulator(drawn: bool) -> None:
     env.reset(seed=3)
     for word, change in changes.items():
         words += f"task.{word}".split()
-        other.batch.renew(core.compose_configs("Move", "1", num_envs=2, overrides=words))
+        other.batch.renew([load_config(["task=Move", *words])] * 2)
         env.step(np.zeros((2, 6)))
         kept = env.get_state()
         change()
@@ -251,8 +251,7 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
     words, actions = [*OVERRIDES, "observe_target=1", "observe_particles=7"], random_actions()
 
     def made_of(*variants: str) -> list[Config]:
-        each = [[f"variant={one}"] for one in variants]
-        return core.compose_configs("Move", "1", num_envs=2, overrides=words, overrides_per_env=each)
+        return [load_config(["task=Move", *words, f"variant={one}"]) for one in variants]
 
     def episode(batch: core.EpisodeBatch) -> list[np.ndarray]:
         first, info = batch.reset()
@@ -288,13 +287,14 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
     for word in ("observe_target", "observe_particles"):
         less = [one for one in words if not one.startswith(word)]
         with pytest.raises(ValueError, match=word):
-            batch.renew(core.compose_configs("Move", "1", num_envs=2, overrides=less))
+            batch.renew([load_config(["task=Move", *less])] * 2)
     problem = weakref.ref(fresh.problem)
     fresh.close()
     fresh.close()
     assert problem() is None
-    with pytest.raises(RuntimeError, match="closed"):
-        fresh.reset()
+    for call in (fresh.reset, fresh.require_running):
+        with pytest.raises(RuntimeError, match="closed"):
+            call()
     batch.close()
 
 
@@ -349,28 +349,31 @@ def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
 
 def test_configurations_of_a_batch() -> None:
     own = [["variant=3"], ["variant=random", "seed_scene=5"], ["variant=random", "seed_scene=6"]]
-    cfgs = core.compose_configs("Move", "1", num_envs=3, overrides=COARSE, overrides_per_env=own)
-    assert [cfg.variant for cfg in cfgs] == ["3", "random5", "random6"]
+    batch = core.make_batch("Move", "1", num_envs=3, overrides=COARSE, overrides_per_env=own)
+    assert [cfg.variant for cfg in batch.configs] == ["3", "random5", "random6"]
     wrong = [
         ({"overrides": "sim.device=cuda"}, "overrides"),
         ({"overrides": ["task=Rope"]}, "task=Rope"),
         ({"overrides": ["variant=9"]}, "variant 9"),
         ({"num_envs": 0}, "num_envs"),
+        ({"n_envs": 2}, "did you mean num_envs"),
+        ({"device": "cuda"}, "sim.device=cuda"),
         ({"num_envs": 2, "overrides_per_env": [[]]}, "overrides_per_env"),
         ({"config_dir": "no/such/folder"}, "no/such/folder"),
     ]
     for arguments, key in wrong:
         with pytest.raises(ValueError, match=key):
-            core.compose_configs("Move", "1", **arguments)
+            core.make_batch("Move", "1", **arguments)
 
 
 def test_environments_that_cannot_be_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NameNotFound, match="did you mean Move"):
         plab.make("Move-v1")
+    with pytest.raises(NameNotFound, match="choose variant 1, 2"):
+        plab.make("Move", 6)
     with pytest.raises(ValueError, match="render_mode 'ansi'"):
         PlabEnv("Move", render_mode="ansi")
-    own = [[], ["sim.horizon=3"]]
-    cfgs = core.compose_configs("Move", "1", num_envs=2, overrides=COARSE, overrides_per_env=own)
+    cfgs = [load_config(["task=Move", *COARSE, *own]) for own in ((), ["sim.horizon=3"])]
     with pytest.raises(ConfigError, match=r"sim\.horizon"):
         core.EpisodeBatch(cfgs)
     with pytest.raises(ValueError, match="contact 'sticky'"):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import torch
 
 import synthetic
 from plab import bench
@@ -20,11 +21,14 @@ from plab.cli.submissions import submit
 from plab.cli.suite import demonstrations, targets
 from plab.config import build_scene, load_config
 from plab.config.compose import check_sources
+from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import make_sb3
+from plab.envs.single import PlabEnv
 from plab.errors import PlabError
-from plab.problem import Problem, make_simulator
+from plab.problem import make_simulator
 from plab.render import graphics
 from plab.results import load
+from plab.scenes import Body, Scene
 from plab.sim import Simulator
 from refusals import why
 from suite import scene
@@ -206,10 +210,20 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "another library's environment": (lambda: make_sb3("CartPole-v1"), "'CartPole-v1'"),
     "a text of overrides": (lambda: load_config("task=Move"), "'task=Move'"),
     "half an environment": (lambda: make_sb3("plab/Rope-v1", num_envs=1.5), "num_envs"),
-    "no configuration": (lambda: Problem([]), "configuration"),
+    "no configuration": (lambda: make_simulator([]), "list of configurations"),
+    "one configuration": (lambda: EpisodeBatch(load_config(["task=Move"])), "list of configurations"),
+    "environments in one": (lambda: PlabEnv("Move", num_envs=2), "make_vec"),
+    "a name in place of an id": (lambda: make_sb3("Move"), "plab/<Task>-v<variant>"),
+    "a dictionary of overrides": (lambda: load_config({"task": "Move"}), "list of strings"),
     "overrides for a simulator": (lambda: make_simulator(["task=Move"]), "plab.load_config"),
     "overrides for a scene": (lambda: build_scene("task=Move"), "plab.load_config"),
     "a scene": (lambda: Simulator(scene(("Sphere",))), "Simulator([scene])"),
+    "weights in place of terms": (lambda: Simulator([scene(())], terms={"density": 1.0}), "make_terms"),
+    "a fraction of a particle": (lambda: Simulator([scene((), particles=1e3)]), "whole number"),
+    "a fraction of a substep": (lambda: Simulator([scene((), substeps=7.0)]), "substeps must be a whole"),
+    "a number as vector": (lambda: Simulator([scene((), gravity=-9.8)]), "gravity must be three"),
+    "a body": (lambda: Scene("", Body("sphere", (0.5,) * 3, (0.1,), 9), ()).validate(), "must be tuples"),
+    "a radius": (lambda: Scene("", (Body("sphere", (0.5,) * 3, 0.1, 9),), ()).validate(), "not 0.1"),
     "too many scenes": (lambda: Simulator([scene(("Sphere",))] * 3176), "at most 3175 together"),
     "too large a scene": (lambda: Simulator([scene((), particles=10**9)]), "324 GB"),
     "a text of keys": (lambda: load(keys="task.name"), "'task.name'"),
@@ -224,6 +238,8 @@ def test_calls_from_python(case):
 
 def test_rollouts_of_no_steps_and_of_no_numbers():
     simulator = Simulator([scene(("Sphere",))])
+    actions = torch.zeros((1, 1, simulator.action_dim), requires_grad=True)
+    assert simulator.rollout(actions, gradient=False).step_terms.shape == (1, 1, 0)
     for given in (np.zeros((1, 0, simulator.action_dim)), [["a"]], [[0.0], [0.0, 1.0]]):
         with pytest.raises(PlabError, match=r"actions (have|must be) "):
             simulator.rollout(given, gradient=False)

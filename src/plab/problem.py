@@ -104,10 +104,10 @@ def fits(cfg: Config) -> bool:
     return True
 
 
-def drawn_scenes(cfg: Config, numbers: Iterable[int]) -> list[Config]:
-    """Return the configurations of a task's random scenes that fit the grid, or all if none fits, because
-    building them then raises their errors."""
-    drawn = drawn_configs(cfg, [FIRST_SCENE + number for number in numbers])
+def drawn_scenes(cfg: Config, numbers: Iterable[int], first: int = FIRST_SCENE) -> list[Config]:
+    """Return the configurations of a task's random scenes that fit the grid, by their numbers from ``first``,
+    or all if none fits, because building them then raises their errors."""
+    drawn = drawn_configs(cfg, [first + number for number in numbers])
     return [one for one in drawn if fits(one)] or drawn
 
 
@@ -137,7 +137,6 @@ def make_simulator(
 def kinds_of(cfgs: Sequence[Config]) -> list[str]:
     """Return strings that are equal for configurations of the same environment, which differ only in seed,
     files and learning."""
-
     texts: dict[int, str] = {}
     for cfg in cfgs:
         # A planner's batch repeats each configuration.
@@ -447,8 +446,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 
 def require_alike(cfgs: Sequence[Config]) -> None:
     """Raise ConfigError unless configurations can share a simulator and an observation space."""
-    if isinstance(cfgs, Config) or not cfgs:
-        raise ConfigError("pass a list of configurations, one per environment: [cfg]")
+    require_configs(cfgs)
     keys = ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets", *OBSERVATION_KEYS)
     parts = [dict(leaves({key: _plain(attrgetter(key)(cfg)) for key in keys})) for cfg in cfgs]
     for number, this in enumerate(parts):

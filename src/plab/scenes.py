@@ -488,12 +488,15 @@ class Scene:
 
     def validate(self) -> None:
         """Raise SceneError for an invalid scene; the message names the field and a valid value."""
+        for parts in (self.bodies, self.manipulators):
+            _require(isinstance(parts, Sequence), "bodies and manipulators must be tuples: (body,)")
         _require(len(self.bodies) > 0, "a scene needs at least one body")
-        _require(self.grid_size >= 8, f"grid_size must be at least 8 nodes per axis (got {self.grid_size})")
+        for name, least in (("grid_size", 8), ("substeps", 1)):
+            count = getattr(self, name)
+            _require(is_whole(count, least), f"{name} must be a whole number, {least} or more, not {count}")
         self.material.validate()
         for number, material in enumerate(self.materials):
             material.validate(f"bodies[{number}]: ")
-        _require(self.substeps >= 1, f"substeps must be at least 1 (got {self.substeps})")
         _require(self.dt > 0, f"dt must be positive (got {self.dt:g})")
         _require(self.floor_friction >= 0, f"floor_friction must be at least 0 (got {self.floor_friction:g})")
         if self.dt > self.stable_dt:
@@ -507,6 +510,7 @@ class Scene:
         for name in ("sampling_convention", "digits_convention", "floor_stencil"):
             choice = getattr(self, name)
             _require(choice in CONVENTIONS, f"{name} '{choice}' is not one of {', '.join(CONVENTIONS)}")
+        _require(np.shape(self.gravity) == (3,), f"gravity must be three numbers, not {self.gravity}")
         limit = self.dx / self.dt**2
         advice = f"accelerates by more than a cell per substep: use at most {limit:.3g}"
         _require(math.hypot(*self.gravity) <= limit, f"gravity {self.gravity} {advice}")
@@ -527,9 +531,13 @@ class Scene:
         shapes = ", ".join(BODY_SHAPES)
         _require(body.shape in BODY_SHAPES, f"{label}: shape '{body.shape}' is not one of {shapes}")
         entries = 3 if body.shape == "box" else 1
-        fits = len(body.size) == entries and all(0 < size < math.inf for size in body.size)
+        fits = np.shape(body.size) == (entries,) and all(0 < size < math.inf for size in body.size)
         _require(fits, f"{label}: a {body.shape} needs {entries} positive size(s), not {body.size}")
-        _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
+        _require(
+            is_whole(body.particles),
+            f"{label}: particles must be a positive whole number, not {body.particles}",
+        )
+        _require(np.shape(body.center) == (3,), f"{label}: center must be three numbers, not {body.center}")
         top = 1.0 - 3.0 * self.dx
         for name, middle, half in zip("xyz", body.center, body.half_extent(), strict=True):
             low, high = middle - half, middle + half
@@ -553,11 +561,12 @@ class Scene:
         if shape is None:
             raise SceneError(f"{label}: shape '{tool.shape}' is not one of {shapes}")
         label = f"{label}: a {tool.shape}"
-        fits = len(tool.size) == len(shape.size_names) and all(0 < size < math.inf for size in tool.size)
+        sized = np.shape(tool.size) == (len(shape.size_names),)
+        fits = sized and all(0 < size < math.inf for size in tool.size)
         names = ", ".join(shape.size_names)
         _require(fits, f"{label} needs positive, finite sizes ({names}), not {tool.size}")
         scales = tool.action_dim if shape.scaled else 0
-        _require(len(tool.scale) == scales, f"{label} needs {scales} scale(s), not {len(tool.scale)}")
+        _require(np.shape(tool.scale) == (scales,), f"{label} needs {scales} scale(s), not {tool.scale}")
         norm = math.hypot(*tool.rotation)
         _require(abs(norm - 1.0) < 1e-3, f"{label} needs a unit quaternion: rotation has length {norm:.4g}")
         friction = f"{label} has friction {tool.friction:g}: it must be finite and at least 0"
@@ -578,6 +587,11 @@ class Scene:
                 f"{label} moves it by up to {way:.3g} per step, more than a cell per substep: scale it by "
                 f"{limit / way:.2g} or less, or use substeps >= {math.ceil(way / self.dx)}"
             )
+
+
+def is_whole(value: object, least: int = 1) -> bool:
+    """Return True for a whole number of at least ``least``."""
+    return isinstance(value, int | np.integer) and value >= least
 
 
 def _require(condition: bool, message: str) -> None:
@@ -656,7 +670,7 @@ class Camera:
             raise SceneError("camera.position and camera.target must differ")
         if not 0.0 < self.field_of_view < 180.0:
             raise SceneError(f"camera.field_of_view must be in (0, 180) degrees (got {self.field_of_view:g})")
-        if len(self.size) != 2 or min(self.size) < 1:
+        if np.shape(self.size) != (2,) or not all(map(is_whole, self.size)):
             raise SceneError(f"camera.size must be a width and a height in pixels (got {self.size})")
         if not 0.0 < self.near < self.far:
             raise SceneError(f"camera.near must be positive and below camera.far (got {self.near:g})")

@@ -38,11 +38,6 @@ HOLD = 10
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
 
-def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Uniform, independent actions, shape [steps, size]."""
-    return rng.uniform(-1.0, 1.0, size=(steps, size))
-
-
 def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
     """Actions whose components are at either end of their range for up to :data:`HOLD` steps each."""
     out = np.empty((steps, size))
@@ -52,7 +47,10 @@ def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.nda
     return out
 
 
-ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
+ACTIONS = {
+    "random": lambda rng, steps, size: rng.uniform(-1.0, 1.0, size=(steps, size)),
+    "bang-bang": bang_bang_actions,
+}
 
 
 def rows(precision: str, quick: bool, device: str) -> Iterator[dict[str, object]]:

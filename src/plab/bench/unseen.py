@@ -9,12 +9,12 @@ from typing import Any, cast
 import numpy as np
 
 from plab.cli.command import Parser, command_line, measure_table, positive, sources_and_words, to_write
-from plab.config import Config, drawn_configs, load_config
+from plab.config import Config, load_config
 from plab.config.selection import OBSERVATION_KEYS
 from plab.envs.core import EpisodeBatch
 from plab.errors import ArgumentError
 from plab.plugins import load_object
-from plab.problem import fits
+from plab.problem import drawn_scenes
 from plab.results import read
 from plab.runners.policy import load_policy
 
@@ -59,9 +59,7 @@ def rows(
 
     for name, (policy, own, trained_on) in policies.items():
         cfg = load_config([*own, *words])
-        every = drawn_configs(cfg, range(FIRST, FIRST + count))
-        # Errors of these scenes are raised when they are built.
-        drawn = [one for one in every if fits(one)] or every
+        drawn = drawn_scenes(cfg, range(count), FIRST)
         if len(drawn) < 2:
             raise ArgumentError(
                 f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"

@@ -53,11 +53,7 @@ class _Composed(Config):
 ConfigStore.instance().store(name="plab_schema", node=_Composed)
 
 
-TABLES = {
-    "lr_by_task": "numbers",
-    "contact_by_task": "contact",
-    "max_gradient_norm_by_numbers": "numbers",
-}
+TABLES = {"lr_by_task": "numbers", "contact_by_task": "contact", "max_gradient_norm_by_numbers": "numbers"}
 """Tables of a method, and the key of ``protocol`` that selects a row."""
 
 
@@ -238,7 +234,9 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
 
 
 def require_configs(cfgs: object) -> None:
-    """Raise ConfigError unless ``cfgs`` is a sequence of configurations."""
+    """Raise ConfigError unless ``cfgs`` is a sequence of at least one configuration."""
+    if isinstance(cfgs, Config) or cfgs in ([], ()):
+        raise ConfigError("pass a list of configurations, one per environment: [cfg]")
     if not isinstance(cfgs, Sequence) or not all(isinstance(cfg, Config) for cfg in cfgs):
         raise ConfigError("pass a configuration, such as plab.load_config(['task=Move', 'seed=3'])")
 

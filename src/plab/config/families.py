@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from plab.errors import ConfigError
-from plab.plugins import Registry, load_object
+from plab.plugins import Registry
 
 RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
@@ -89,10 +89,6 @@ class Family:
         """Return the type of the ``method`` section, which may depend on the rule."""
         own = self.rules.get(rule or "")
         return self.config if own is None or own.config is None else own.config
-
-    def runner_type(self) -> type:
-        """Return the runner; raise ConfigError if it cannot be imported."""
-        return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
 
 
 _NAMES = ("trajectory", "rl", "apg", "pods", "shac", "bc", "mpc", "identify")

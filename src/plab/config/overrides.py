@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -27,8 +27,8 @@ _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IG
 
 def prepared(words: Sequence[str]) -> list[str]:
     """Return overrides in the form that Hydra reads: names of folders and files quoted, ``.inf`` as ``inf``;
-    raise ConfigError for a string in place of a list."""
-    if isinstance(words, str):
+    raise ConfigError for anything but a list of strings."""
+    if isinstance(words, str | Mapping | None) or not all(isinstance(word, str) for word in words):
         raise ConfigError(
             f"overrides must be a list of strings, such as ['task=Move', 'seed=3'], not {words!r}"
         )

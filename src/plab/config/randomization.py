@@ -196,7 +196,10 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     base = cast(DictConfig, OmegaConf.merge(task, fixed))
     base.variants = base.random = {}  # Values that no attempt changes are not copied.
     if "seed" in base.target.keys():
-        fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}}))
+        # Not Generator.integers: NumPy guarantees that SeedSequence does not change.
+        (word,) = np.random.SeedSequence([seed_scene, _TARGET_SEED]).generate_state(1)
+        seed = FIRST_TARGET_SEED + int(word) % (2**31 - FIRST_TARGET_SEED)
+        fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": seed}}))
     rng = np.random.default_rng([seed_scene, _NUMBERS])
     for _ in range(ATTEMPTS):
         changes = cast(DictConfig, OmegaConf.merge(fixed, _draw(base, random, rng)))
@@ -209,12 +212,6 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     raise ConfigError(
         f"task {task.name}: all {ATTEMPTS} samples with seed_scene={seed_scene} are invalid; the last: {flaw}"
     )
-
-
-def _target_seed(seed_scene: int) -> int:
-    # Not Generator.integers: NumPy guarantees that SeedSequence does not change.
-    (word,) = np.random.SeedSequence([seed_scene, _TARGET_SEED]).generate_state(1)
-    return FIRST_TARGET_SEED + int(word) % (2**31 - FIRST_TARGET_SEED)
 
 
 def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> DictConfig:

@@ -45,11 +45,13 @@ def make_vec(
 def _env_id(task: str, variant: str | int) -> str:
     env_id = f"plab/{task}-v{variant}"
     if env_id not in gymnasium.registry:
-        ids = [name for name in gymnasium.registry if name.startswith("plab/")]
-        advice = suggest(task, sorted({name[len("plab/") :].rpartition("-v")[0] for name in ids}))
-        raise gymnasium.error.NameNotFound(
-            f"{env_id} is not registered: pass task and variant, such as make('Rope', 2); {advice}"
-        )
+        ids = [name[len("plab/") :].rpartition("-v") for name in gymnasium.registry if "plab/" in name]
+        if variants := [number for name, _, number in ids if name == task]:
+            advice = f"choose variant {', '.join(variants)}, or overrides=['variant=random', 'seed_scene=7']"
+        else:
+            known = suggest(str(task), sorted({name for name, _, _ in ids}))
+            advice = f"pass task and variant, such as make('Rope', 2); {known}"
+        raise gymnasium.error.NameNotFound(f"{env_id} is not registered: {advice}")
     return env_id
 
 

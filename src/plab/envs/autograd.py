@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import floating, simulator_input
+from plab.errors import ArgumentError
 from plab.sim.state import require_none
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from plab.sim import RecordedStates, Simulator, State
 
 
+@torch._disable_dynamo
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
     """Simulate actions from the initial states, and return the trajectory losses, differentiable with respect
     to the actions.
@@ -81,6 +83,7 @@ class States(NamedTuple):
     mass: torch.Tensor
 
 
+@torch._disable_dynamo
 def simulate(
     simulator: Simulator,
     actions: torch.Tensor,
@@ -225,8 +228,10 @@ def policy_gradient(
         Observations, actions and losses, without gradients; errors are those of
         :meth:`plab.envs.core.EpisodeBatch.closed_loop`.
     """
-    own = cast(torch.nn.Module, policy).parameters() if parameters is None else parameters
+    own = getattr(policy, "parameters", list)() if parameters is None else parameters
     parameters = [one for one in own if one.requires_grad]
+    if not parameters:
+        raise ArgumentError("the policy has no parameters with gradients: pass a module, or parameters=...")
     like = parameters[0].detach()
     seen: list[torch.Tensor] = []
     done: list[torch.Tensor] = []

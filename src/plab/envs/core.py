@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
+import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,18 +17,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from gymnasium import logger
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config, ranges
+from plab.config.compose import require_configs
 from plab.config.overrides import prepared
 from plab.config.randomization import Values, with_own_materials
 from plab.envs.observations import Array, Sensors, mapped, spaces
 from plab.envs.randomization import EpisodeRandomizer
-from plab.errors import ArgumentError
+from plab.errors import ArgumentError, suggest
 from plab.objective import earth_movers_distances
 from plab.problem import Problem, build_scenes, make_simulator, require_alike
-from plab.scenes import CONTACTS, Camera
+from plab.scenes import CONTACTS, Camera, is_whole
 from plab.sim import SimulationError, Simulator, State
 from plab.sim.tensors import Constants, on_device
 
@@ -59,34 +63,18 @@ def _alone(method: _Method) -> _Method:
 
 
 @_alone
-def make_batch(task: str, variant: str, **options: Any) -> EpisodeBatch:
-    """Create the episodes of an environment.
-
-    Args:
-        task: Name of the task.
-        variant: Name of the variant.
-        **options: Other arguments of :func:`compose_configs`, keyword arguments of :class:`EpisodeBatch`, and
-            ``max_episode_steps``, Gymnasium's name of ``sim.horizon``.
-
-    Errors are those of :func:`compose_configs` and :class:`EpisodeBatch`.
-    """
-    if (steps := options.pop("max_episode_steps", None)) is not None:
-        options["overrides"] = [*options.get("overrides", ()), f"sim.horizon={steps}"]
-    names = ("num_envs", "overrides", "overrides_per_env", "config_dir")
-    own = {name: options.pop(name) for name in names if name in options}
-    return EpisodeBatch(compose_configs(task, variant, **own), **{"stages": True} | options)
-
-
-def compose_configs(
+def make_batch(
     task: str,
     variant: str,
     *,
     num_envs: int = 1,
     overrides: Sequence[str] = (),
     overrides_per_env: Sequence[Sequence[str]] | None = None,
+    max_episode_steps: int | None = None,
     config_dir: str | Path | None = None,
-) -> list[Config]:
-    """Compose one configuration per sub-environment.
+    **options: Any,
+) -> EpisodeBatch:
+    """Create the episodes of an environment.
 
     Args:
         task: Name of the task.
@@ -95,25 +83,32 @@ def compose_configs(
         overrides: Overrides for all of them, as on the command line: ``["sim.device=cuda"]``.
         overrides_per_env: Additional overrides, one list per sub-environment, such as ``[["variant=1"],
             ["variant=random", "seed_scene=5"]]``, except for ``sim`` and ``method``.
+        max_episode_steps: Gymnasium's name of ``sim.horizon``.
         config_dir: Folder with the user's YAML files.
+        **options: Keyword arguments of :class:`EpisodeBatch`, whose errors apply.
 
     Raises:
-        ValueError: If numbers do not match, or overrides are not lists or set the task.
+        ValueError: If an argument is unknown or does not fit, or an override sets the task.
         plab.config.ConfigError: If an override or a file is invalid.
     """
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+    known = {*inspect.signature(make_batch).parameters, *inspect.signature(EpisodeBatch).parameters}
+    if unknown := sorted(set(options) - known):
+        raise ArgumentError(
+            f"environments have no argument '{unknown[0]}': keys of the configuration are overrides, such as "
+            f"overrides=['sim.device=cuda']; {suggest(unknown[0], sorted(known - {'cfgs', 'options'}))}"
+        )
+    if not is_whole(num_envs) or isinstance(num_envs, bool):
         raise ArgumentError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
     own = [()] * num_envs if overrides_per_env is None else list(overrides_per_env)
     if len(own) != num_envs:
         raise ArgumentError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
     for entries in (overrides, *own):
         if own_task := [word for word in prepared(entries) if word.partition("=")[0] == "task"]:
-            raise ArgumentError(
-                f"'{own_task[0]}' has no effect on an environment of task {task}: create another environment"
-            )
-    lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
+            raise ArgumentError(f"'{own_task[0]}' has no effect on an environment of {task}: create another")
+    steps = [] if max_episode_steps is None else [f"sim.horizon={max_episode_steps}"]
+    lists = [(f"task={task}", f"variant={variant}", *overrides, *steps, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
-    return [made[entries] for entries in lists]
+    return EpisodeBatch([made[entries] for entries in lists], **{"stages": True} | options)
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
@@ -274,10 +269,13 @@ class EpisodeBatch:
 
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
         """Return configurations, sharing one object between equal ones, and their ranges."""
+        require_configs(cfgs)
         unique = {id(cfg): cfg for cfg in cfgs}
         for key, cfg in unique.items():
             if self._randomize is not None:
-                cfg = replace(cfg, task=replace(cfg.task, randomize=dict(self._randomize)))
+                # Arrays and their numbers become lists and numbers.
+                text = json.dumps(self._randomize, default=lambda array: array.tolist())
+                cfg = replace(cfg, task=replace(cfg.task, randomize=json.loads(text)))
                 cfg.check()
             unique[key] = with_own_materials(cfg)
         return [unique[id(cfg)] for cfg in cfgs]
@@ -397,8 +395,8 @@ class EpisodeBatch:
         chosen = slice(None) if environments is None else list(_on_host(environments))
         rows = np.arange(self.size)[chosen].tolist()
         if seeds is not None:
-            for e, seed in zip(rows, seeds, strict=True):
-                self._seeds[e], self._episodes[e] = (int(seed),), -1
+            for e, seed in zip(rows, checked_seeds(seeds, len(rows)), strict=True):
+                self._seeds[e], self._episodes[e] = (seed,), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
         drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}
@@ -428,7 +426,6 @@ class EpisodeBatch:
 
     def _update(self, observation: Any, measured: tuple[Array, ...], kept: Sequence[int]) -> None:
         """Store observations and measures, as arrays or CUDA tensors, except for some environments."""
-
         before, self._last = self._last, (observation, *measured)
         for table, old in zip(self._last, before, strict=True) if kept else ():
             mapped(lambda new, known: _set_rows(new, kept, known[kept]), table, old)
@@ -438,6 +435,7 @@ class EpisodeBatch:
     ) -> None:
         """Raise ResetNeeded if an episode has fewer steps left or, unless ``frozen``, has diverged, except
         ``idle`` ones."""
+        _ = self.problem  # raises RuntimeError if the environment is closed
         over = self._over | (self._steps + steps > self.horizon) | (not frozen and self.over)
         if np.any(over & ~np.asarray(idle)):
             raise ResetNeeded("the episode is over or has not started: call reset() before step()")
@@ -666,9 +664,11 @@ class Restorable:
 
     Attributes:
         batch: The episodes.
+        render_mode: ``rgb_array``, or None for no pictures.
     """
 
     batch: EpisodeBatch
+    render_mode: str | None
     _arguments: dict[str, Any]
 
     @property
@@ -714,13 +714,31 @@ class Restorable:
         if seed is None and not self._is_seeded:
             seed = [int(one) for one in self.np_random.integers(2**31, size=count)]  # type: ignore[attr-defined]
         self._is_seeded = True
-        return [seed + e for e in range(count)] if isinstance(seed, int) else seed
+        if isinstance(seed, int | np.integer):
+            seed = [int(seed) + e for e in range(count)]
+        return None if seed is None else checked_seeds(seed, count)
 
     _is_seeded = False
 
     def get_state(self) -> EpisodeState:
         """Return a copy of the state of the episodes; see :meth:`EpisodeBatch.get_state`."""
         return self.batch.get_state()
+
+    def render(self) -> Any:
+        """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
+        ``render_mode`` is ``rgb_array``."""
+        if self.render_mode is None:
+            logger.warn('nothing to render: make the environment with render_mode="rgb_array"')
+            return None
+        return self.batch.frames()
+
+
+def checked_seeds(seeds: Sequence[int], count: int) -> list[int]:
+    """Return one seed per environment; raise ValueError if they are anything else."""
+    numbers: Any = np.asarray(seeds).tolist()
+    if np.shape(numbers) != (count,) or not all(is_whole(number, 0) for number in numbers):
+        raise ArgumentError(f"seeds must be {count} whole numbers of at least 0, not {seeds}")
+    return list(numbers)
 
 
 def _set_rows(table: Array, rows: Sequence[int] | np.ndarray, values: Array) -> None:

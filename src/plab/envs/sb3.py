@@ -26,16 +26,14 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
         env_id: Id, such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
         render_mode: ``rgb_array``, or None for no pictures.
-        **options: Arguments of :func:`plab.envs.core.compose_configs` and
-            :class:`plab.envs.core.EpisodeBatch`, whose errors apply. With multiple observations, the policy
-            must accept dictionaries, as ``MultiInputPolicy`` does.
+        **options: Arguments of :func:`plab.envs.core.make_batch`, whose errors apply. With
+            multiple observations, the policy must accept dictionaries, as ``MultiInputPolicy`` does.
 
     Raises:
-        gymnasium.error.Error: If the id does not exist.
-        ValueError: If the id does not belong to plab.
+        ValueError: If no environment of plab has this id.
     """
-    spec = gymnasium.spec(env_id)
-    if spec.entry_point != ENTRY_POINT:
+    spec = gymnasium.registry.get(env_id)
+    if spec is None or spec.entry_point != ENTRY_POINT:
         raise ArgumentError(
             f"'{env_id}' is not a plab environment: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
@@ -133,18 +131,14 @@ class PlabVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all sub-environments; raise ValueError if only some are selected."""
         if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ArgumentError(
-                f"'{attr_name}' cannot be set for individual sub-environments, because all share it"
-            )
+            raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments: all share it")
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Raise AttributeError, because there are no separate environment objects."""
-        raise AttributeError(
-            f"sub-environments are not separate objects with methods such as '{method_name}'"
-        )
+        raise AttributeError(f"sub-environments are not objects with methods such as '{method_name}'")
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from plab.envs.core import METADATA, EpisodeState, Restorable, check_render_mode, info_of, make_batch
 from plab.envs.observations import mapped
+from plab.errors import ArgumentError
 
 
 class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
@@ -34,9 +35,10 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
             task: Name of the task.
             variant: Name of the variant.
             render_mode: ``rgb_array``, or None for no pictures.
-            **options: Arguments of :func:`plab.envs.core.compose_configs` and
-                :class:`plab.envs.core.EpisodeBatch`, whose errors apply.
+            **options: Arguments of :func:`plab.envs.core.make_batch`, whose errors apply.
         """
+        if "num_envs" in options:
+            raise ArgumentError("num_envs is an argument of make_vec, of plab and of gymnasium, not of make")
         self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}
         self.render_mode = check_render_mode(render_mode)
         self.batch = make_batch(task, variant, **options)
@@ -61,7 +63,10 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one step; errors are those of :meth:`plab.envs.core.EpisodeBatch.step`."""
         self.batch.require_running()
-        done = self.batch.step(np.asarray(action)[None], strict=False)
+        action, expected = np.asarray(action), self.action_space.shape
+        if action.shape != expected:
+            raise ArgumentError(f"actions have the shape {expected}, not {action.shape}")
+        done = self.batch.step(action[None], strict=False)
         ends = bool(done.terminated[0]), bool(done.cut_off[0])
         observation, info = _first(done.observation, done.info, done.failures)
         return observation, float(done.reward[0]), *ends, info
@@ -72,10 +77,8 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('nothing to render: make the environment with render_mode="rgb_array"')
-            return None
-        return self.batch.frames()[0]
+        frames = super().render()
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Release the simulator; closing twice is allowed."""

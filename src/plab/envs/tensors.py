@@ -13,8 +13,9 @@ from plab.sim import Simulator
 
 
 def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
-    """Return actions as floating-point numbers, converting integers to the simulator's precision; raise
-    TypeError for complex numbers."""
+    """Return actions, also given as arrays, as floating-point numbers, converting integers to the
+    simulator's precision; raise TypeError for complex numbers."""
+    actions = torch.as_tensor(actions)
     if actions.is_complex():
         raise TypeError(f"actions must be real numbers, not {actions.dtype}")
     return actions if actions.is_floating_point() else actions.to(getattr(torch, simulator.precision))
@@ -31,7 +32,7 @@ class TensorEnv:
     """A batch of episodes with tensors as inputs and outputs.
 
     On CUDA the tensors are on the simulator's device; only the check of actions and the divergence flags pass
-    through the host.
+    through the host. Functions that use it may be compiled by ``torch.compile``, which leaves it out.
 
     Attributes:
         batch: The environments, with spaces, horizon and problem.
@@ -44,12 +45,14 @@ class TensorEnv:
         self.device = torch.device(batch.problem.simulator.device)
         self._like = torch.empty(0, device=self.device)
 
+    @torch._disable_dynamo
     def reset(self, **how: Any) -> Any:
         """Start episodes; return observations, shape [batch, entry], or by key. Arguments are those of
         :meth:`plab.envs.core.EpisodeBatch.reset`."""
         observation, _info = self.batch.reset(self._like, **how)
         return mapped(torch.as_tensor, observation)
 
+    @torch._disable_dynamo
     def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
         """Advance all environments by one step.
 
@@ -60,7 +63,7 @@ class TensorEnv:
             precision for integer actions; ``success`` is a mask. ``terminated``, ``truncated`` and sampled
             parameters are arrays.
         """
-        actions = floating(actions.detach().to(self.device), self.batch.problem.simulator)
+        actions = floating(actions, self.batch.problem.simulator).detach().to(self.device)
         if self.device.type == "cuda":
             return self.batch.step(actions, strict=strict)
         done = self.batch.step(actions.double().numpy(), strict=strict)

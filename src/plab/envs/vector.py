@@ -6,7 +6,6 @@ import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -52,8 +51,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
                 step after the end of an episode, which ignores the action; ``SameStep`` in the last step of
                 the episode, with the final observation in ``infos["final_obs"]``; ``Disabled`` requires
                 :meth:`reset` with ``options={"reset_mask": ...}``.
-            **options: Arguments of :func:`plab.envs.core.compose_configs` and
-                :class:`plab.envs.core.EpisodeBatch`, whose errors apply.
+            **options: Arguments of :func:`plab.envs.core.make_batch`, whose errors apply.
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
@@ -84,12 +82,10 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         given = dict(options or {})
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ArgumentError(
-                f"reset_mask must be {self.num_envs} booleans, at least one of them True (got {mask})"
-            )
-        super().reset(seed=seed if seed is None or isinstance(seed, int) else seed[0])
+            raise ArgumentError(f"reset_mask must be {self.num_envs} booleans, not all False (got {mask})")
         seeds = self._first_seeds(seed)
         if seeds is not None:
+            super().reset(seed=None if seed is None else seeds[0])
             seeds = [one for one, chosen in zip(seeds, mask, strict=True) if chosen]
         return self._restarted(mask, seeds=seeds, options=given)
 
@@ -125,14 +121,6 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Restore a state from :meth:`get_state`; return its observations and ``info``."""
         observation, info = self.batch.set_state(state)
         return observation, self._masked(info, self.batch.failures)
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
-        ``render_mode`` is ``rgb_array``."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('nothing to render: make the environments with render_mode="rgb_array"')
-            return None
-        return self.batch.frames()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the simulator."""

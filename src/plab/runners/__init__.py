@@ -14,6 +14,7 @@ from contextlib import suppress
 from plab.config import Config
 from plab.config.families import FAMILIES, Appearance, Family, Rule, family
 from plab.errors import ConfigError, PlabError, traceback_wanted
+from plab.plugins import load_object
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.runners.runner import (
     Outcome,
@@ -114,7 +115,9 @@ def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -
             party = parties.pop(0)
             try:
                 name = party[0].cfg.method.family
-                kind = family(name).runner_type()
+                kind = family(name).runner
+                if isinstance(kind, str):
+                    kind = load_object(kind, type)
                 if not issubclass(kind, Runner):
                     raise ConfigError(f"the runner of method.family '{name}' is not a plab.runners.Runner")
                 kind(party, note, cache).run()

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.config import ranges
 from plab.plugins import torch
-from plab.runners.agents import (
-    OffPolicyAgents,
-    OffPolicyConfig,
-    adam,
-    descend,
-    follow,
-    mlp,
-    twin_values,
-)
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, adam, descend, follow, mlp, twin_values
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:

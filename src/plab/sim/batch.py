@@ -35,7 +35,7 @@ def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
     """Raise SceneError if scenes (and ``like``) cannot be simulated or cannot share a simulator."""
-    if not isinstance(scenes, Sequence):
+    if not isinstance(scenes, Sequence) or not all(isinstance(scene, Scene) for scene in scenes):
         raise SceneError(
             "a simulator takes a list of scenes, one per environment: Simulator([scene]); "
             "plab.make_simulator takes a Config"
@@ -44,9 +44,6 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
         raise SceneError("a simulator needs at least one scene")
     first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
     for number, scene in enumerate(scenes):
-        if not isinstance(scene, Scene):
-            kind = type(scene).__name__
-            raise SceneError(f"scenes must be of type Scene, not {kind}: plab.make_simulator takes a Config")
         scene.validate()
         for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
             if own != other:

@@ -650,6 +650,8 @@ class Simulator:
         """
         if not self.terms:
             raise ArgumentError("there is no loss to differentiate: pass terms with weights to Simulator")
+        if steps < 1:
+            raise ArgumentError(f"steps must be at least 1, not {steps}")
         poses = self._pose_history(steps, np.asarray(self.poses()))
         engine, particles, tape = self._engine, self._particles, self._tape
         row, posed_shape = engine.batch * engine.actions_per_step, (engine.batch, engine.manipulators, 8)
@@ -851,9 +853,9 @@ class Simulator:
         return self._particles.unpack(to_host(bar), poses, order)
 
     def _require_fitting(self, scenes: Sequence[Scene]) -> None:
+        require_alike(scenes, self.scenes[0])
         if len(scenes) != self.batch:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
-        require_alike(scenes, self.scenes[0])
 
     def _start_positions(
         self, scenes: Sequence[Scene], particles: Sequence[np.ndarray] | None

@@ -177,7 +177,8 @@ def _numbers(
     open (None). CUDA tensors are complete on return. Raise ArgumentError for wrong shapes and non-finite
     actions."""
     try:
-        actions = actions.detach() if on_device(actions) else np.asarray(actions, np.float64)
+        actions = getattr(actions, "detach", lambda: actions)()
+        actions = actions if on_device(actions) else np.asarray(actions, np.float64)
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"actions must be a numeric array: {error}") from None
     shape = tuple(actions.shape)

@@ -53,6 +53,8 @@ class TermPhases(Storage):
         Args:
             terms: Terms as in :mod:`plab.losses.term`, not attached before; those of weight 0 are left out.
         """
+        if not all(hasattr(term, "weighted") for term in terms):
+            raise ArgumentError("make terms by plab.losses.make_terms, such as make_terms({'contact': 1.0})")
         weighted = [t for t in terms if t.weighted and t.weight != 0.0]
         # Terms without weight, which are only measured, come last.
         self.terms = (*weighted, *(t for t in terms if not t.weighted))

@@ -13,13 +13,7 @@ from plab.targets.build import (
     load_release_target,
     make_recipe,
 )
-from plab.targets.recipes import (
-    EPISODE_STEPS,
-    TARGET_SEED,
-    BodiesTarget,
-    TargetBody,
-    TargetError,
-)
+from plab.targets.recipes import EPISODE_STEPS, TARGET_SEED, BodiesTarget, TargetBody, TargetError
 
 __all__ = [
     "EPISODE_STEPS",
