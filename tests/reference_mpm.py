@@ -430,16 +430,12 @@ def from_frame(pose: Tensor, points: Tensor) -> Tensor:
 
 def to_frame(pose: Tensor, points: Tensor) -> Tensor:
     """Inverse of :func:`from_frame`."""
-    return rotate(_conjugate(pose[3:7]), points - pose[:3])
+    return rotate(pose[3:7] * pose.new_tensor([1, -1, -1, -1]), points - pose[:3])
 
 
 def rigid_velocity(pose: Tensor, end_pose: Tensor, points: Tensor, dt: float) -> Tensor:
     """Velocity of points [..., 3] carried from one pose [8] to another in the time dt."""
     return (from_frame(end_pose, to_frame(pose, points)) - points) / dt
-
-
-def _conjugate(q: Tensor) -> Tensor:
-    return torch.cat([q[:1], -q[1:]])
 
 
 # ----------------------------------------------------------------------------- manipulators: signed distances

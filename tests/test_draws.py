@@ -110,10 +110,13 @@ def test_seeds_and_options(vector) -> None:
     given = drawn(seed=1, options={"yield_stress": 50.0, "bodies.ball.yaw": np.array([0.5, 0.0])})
     assert given["yield_stress"].tolist() == [50, 50] and given["bodies.ball.yaw"].tolist() == [0.5, 0]
     assert np.array_equal(given["gravity"], one["gravity"])
-    refused = {"yield_strength": 1.0, "yield_stress": -1.0, "gravity": 3.0, "scene": 0}
+    refused = {"yield_strength": 1.0, "yield_stress": [60, -1], "gravity": 3.0, "scene": 0}
     for key, value in {**refused, "bodies.ball.offset": [0.9, 0.0, 0.0]}.items():
         with pytest.raises(ValueError, match=key.rpartition(".")[2]):
             vector.reset(options={key: value})
+    # Values of a refused reset are not those of the next one.
+    assert drawn(options={"yield_stress": 60})["yield_stress"].dtype == float
+    assert [scene.yield_stress for scene in vector.batch.problem.simulator.scenes] == [60.0, 60.0]
 
 
 def test_what_is_drawn_is_what_is_simulated(vector) -> None:

@@ -108,12 +108,6 @@ def assert_nothing_else_is_left(*results: RunResult) -> None:
     assert names == {path.name for one in results for path in (one.path, policy_path(one.path))}
 
 
-def batches_of(*cfgs: Config) -> list[EpisodeBatch]:
-    """Training environments, two per run, and evaluation environments."""
-    own = [cfg for cfg in cfgs for _ in range(2)]
-    return shared_batches(CACHE, (own, cfgs[0].method.contact), (cfgs, "hard"))
-
-
 @pytest.fixture(scope="module")
 def lone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[RunResult]]:
     """Uninterrupted single runs."""
@@ -151,7 +145,8 @@ def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
     for name in COLUMNS:
         assert result.evaluation[name] == pytest.approx(rows[name][best], rel=1e-5, abs=1e-6), name
     # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
-    _, judge = batches_of(make_config(result.path.parents[2], method))
+    cfg = make_config(result.path.parents[2], method)
+    _, judge = shared_batches(CACHE, ([cfg] * 2, cfg.method.contact), ([cfg], "hard"))
     policy, last = load_policy(result.path), rows.iloc[-1]
     (measures,), _, _ = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen.numpy())))
     for name, value in measures.items():

@@ -129,12 +129,7 @@ def test_a_run_under_way_in_another_process_is_left_to_it(sweep, capsys) -> None
 
 def test_a_run_that_another_process_gives_up_is_taken_up(sweep, monkeypatch) -> None:
     other, intact = RunFile(configs(seeds=(1,))[0]), toy_runner.run_toy
-
-    def end_of_the_other(jobs) -> None:
-        intact(jobs)
-        other.release()
-
-    monkeypatch.setattr(toy_runner, "run_toy", end_of_the_other)
+    monkeypatch.setattr(toy_runner, "run_toy", lambda jobs: (intact(jobs), other.release()))
     assert sweep("seed=0,1,2")[:2] == (0, {"runs": 3, "finished": 3})
     assert_complete(configs())
 

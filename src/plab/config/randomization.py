@@ -75,7 +75,7 @@ def checked(task: TaskConfig, key: str, value: Any, path: str) -> Any:
         raise ConfigError(f"{path}: {value} is not {wanted}")
     if not np.isfinite(numbers).all() or (key == NOISE and numbers < 0):
         raise ConfigError(f"{path}: {value} is out of range")
-    return numbers.tolist()
+    return numbers.astype(np.result_type(numbers, np.asarray(present))).tolist()
 
 
 def present_value(task: TaskConfig, key: str, path: str) -> Any:

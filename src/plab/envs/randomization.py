@@ -154,7 +154,7 @@ class EpisodeRandomizer:
         values = {e: own for e, own in values.items() if own != self.values[e]}
         if not values:
             return False
-        scenes, particles, targets = list(problem.scenes), {}, {}
+        scenes, particles, targets, put = list(problem.scenes), {}, {}, {}
         for e, own in values.items():
             base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]
             cfg = with_values(base.cfg, own)
@@ -168,8 +168,11 @@ class EpisodeRandomizer:
             if target != self._targets[e]:
                 known = base.targets[own.get(STAGE, -1)]
                 targets[e] = self._target(base, cfg, scenes[e]) if follows else known
-            self._placed[e], self._targets[e], self.values[e] = place, target, dict(own)
+            put[e] = place, target, dict(own)
         problem.set_episode_starts(scenes, particles, targets)
+        # Only then, because nothing has changed if a value is invalid.
+        for e, changed in put.items():
+            self._placed[e], self._targets[e], self.values[e] = changed
         return True
 
     def enter_stages(self, stages: Mapping[int, int], problem: Problem) -> None:
