@@ -95,8 +95,7 @@ def tools(made: Scene, kinds: Sequence[str]) -> tuple[Manipulator, ...]:
 
 def batch() -> list[Scene]:
     """Scenes: one per manipulator, one with all of them, one with a rough floor, one stiff, one soft."""
-    scenes = [scene((kind,)) for kind in KINDS]
-    scenes.append(scene(KINDS))
+    scenes = [*(scene((kind,)) for kind in KINDS), scene(KINDS)]
     scenes.append(scene((), floor=True, floor_friction=0.4))
     scenes.append(scene(("Sphere", "Box"), yield_stress=5.0, poisson_ratio=0.05))
     scenes.append(scene(("Torus", "Chopsticks"), yield_stress=math.inf, poisson_ratio=0.4))

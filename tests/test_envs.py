@@ -355,7 +355,7 @@ def test_configurations_of_a_batch() -> None:
         ({"overrides": "sim.device=cuda"}, "overrides"),
         ({"overrides": ["task=Rope"]}, "task=Rope"),
         ({"overrides": ["variant=9"]}, "variant 9"),
-        ({"num_envs": 0}, "num_envs"),
+        ({"num_envs": 0}, "num_envs must be a whole"),
         ({"n_envs": 2}, "did you mean num_envs"),
         ({"device": "cuda"}, "sim.device=cuda"),
         ({"num_envs": 2, "overrides_per_env": [[]]}, "overrides_per_env"),
@@ -367,10 +367,9 @@ def test_configurations_of_a_batch() -> None:
 
 
 def test_environments_that_cannot_be_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(NameNotFound, match="did you mean Move"):
-        plab.make("Move-v1")
-    with pytest.raises(NameNotFound, match="choose variant 1, 2"):
-        plab.make("Move", 6)
+    for arguments, named in ((["Move-v1"], "did you mean Move"), (["Move", 6], "choose variant 1, 2")):
+        with pytest.raises(NameNotFound, match=named):
+            plab.make(*arguments)
     with pytest.raises(ValueError, match="render_mode 'ansi'"):
         PlabEnv("Move", render_mode="ansi")
     cfgs = [load_config(["task=Move", *COARSE, *own]) for own in ((), ["sim.horizon=3"])]

@@ -27,11 +27,14 @@ from plab.envs.single import PlabEnv
 from plab.errors import PlabError
 from plab.problem import make_simulator
 from plab.render import graphics
+from plab.render.rollouts import record
 from plab.results import load
+from plab.runners import run_config
 from plab.scenes import Body, Scene
 from plab.sim import Simulator
 from refusals import why
 from suite import scene
+from toy_runner import COARSE
 
 MISSING = graphics.missing_graphics
 
@@ -209,13 +212,14 @@ def test_actions_of_a_result_that_do_not_fit(told, tmp_path):
 CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "another library's environment": (lambda: make_sb3("CartPole-v1"), "'CartPole-v1'"),
     "a text of overrides": (lambda: load_config("task=Move"), "'task=Move'"),
-    "half an environment": (lambda: make_sb3("plab/Rope-v1", num_envs=1.5), "num_envs"),
     "no configuration": (lambda: make_simulator([]), "list of configurations"),
     "one configuration": (lambda: EpisodeBatch(load_config(["task=Move"])), "list of configurations"),
     "environments in one": (lambda: PlabEnv("Move", num_envs=2), "make_vec"),
     "a name in place of an id": (lambda: make_sb3("Move"), "plab/<Task>-v<variant>"),
     "a dictionary of overrides": (lambda: load_config({"task": "Move"}), "list of strings"),
     "overrides for a simulator": (lambda: make_simulator(["task=Move"]), "plab.load_config"),
+    "overrides for a run": (lambda: run_config(["task=Move"]), "plab.load_config"),
+    "a batch of actions": (lambda: record(load_config(COARSE), np.zeros((1, 9, 6))), "shape [T, 6]"),
     "overrides for a scene": (lambda: build_scene("task=Move"), "plab.load_config"),
     "a scene": (lambda: Simulator(scene(("Sphere",))), "Simulator([scene])"),
     "weights in place of terms": (lambda: Simulator([scene(())], terms={"density": 1.0}), "make_terms"),

@@ -148,7 +148,7 @@ def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
     cfg = make_config(result.path.parents[2], method)
     _, judge = shared_batches(CACHE, ([cfg] * 2, cfg.method.contact), ([cfg], "hard"))
     policy, last = load_policy(result.path), rows.iloc[-1]
-    (measures,), _, _ = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen.numpy())))
+    (measures,), _, _ = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen)))
     for name, value in measures.items():
         assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
 

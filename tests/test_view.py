@@ -154,7 +154,6 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(replaye
     assert (view.page, view.score) == (page, recording.score)
     (shown,) = re.findall('<iframe [^>]*height: 300px[^>]* srcdoc="([^"]*)"></iframe>', view._repr_html_())
     assert html.unescape(shown) == page and len(repr(view)) < 100
-
     found = results.RunResult(results.config_dict(cfg), cfg.hash, best_actions=ACTIONS)
     results.write(found, Path("seed0.h5"))
     show("seed0.h5")

@@ -451,9 +451,7 @@ def require_alike(cfgs: Sequence[Config]) -> None:
     parts = [dict(leaves({key: _plain(attrgetter(key)(cfg)) for key in keys})) for cfg in cfgs]
     for number, this in enumerate(parts):
         if differing := [key for key in parts[0] | this if parts[0].get(key) != this.get(key)]:
-            raise ConfigError(
-                f"{differing[0]} differs between sub-environments 0 and {number}: they share one simulator"
-            )
+            raise ConfigError(f"{differing[0]} differs between environments 0 and {number} of one simulator")
 
 
 def _plain(section: Any) -> Any:

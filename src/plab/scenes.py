@@ -591,7 +591,7 @@ class Scene:
 
 def is_whole(value: object, least: int = 1) -> bool:
     """Return True for a whole number of at least ``least``."""
-    return isinstance(value, int | np.integer) and value >= least
+    return isinstance(value, int | np.integer) and bool(value >= least)
 
 
 def _require(condition: bool, message: str) -> None:

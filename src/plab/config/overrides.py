@@ -29,9 +29,7 @@ def prepared(words: Sequence[str]) -> list[str]:
     """Return overrides in the form that Hydra reads: names of folders and files quoted, ``.inf`` as ``inf``;
     raise ConfigError for anything but a list of strings."""
     if isinstance(words, str | Mapping | None) or not all(isinstance(word, str) for word in words):
-        raise ConfigError(
-            f"overrides must be a list of strings, such as ['task=Move', 'seed=3'], not {words!r}"
-        )
+        raise ConfigError(f"overrides must be a list of strings: ['task=Move', 'seed=3'], not {words!r}")
     return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in words]
 
 

@@ -34,9 +34,7 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
     """
     spec = gymnasium.registry.get(env_id)
     if spec is None or spec.entry_point != ENTRY_POINT:
-        raise ArgumentError(
-            f"'{env_id}' is not a plab environment: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
-        )
+        raise ArgumentError(f"plab has no '{env_id}': choose plab/<Task>-v<variant>, such as plab/Rope-v1")
     batch = make_batch(num_envs=num_envs, **spec.kwargs | options)
     return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
 

@@ -141,7 +141,9 @@ def _recording(
     cfg: Config, simulator: Simulator, problem: Problem | None, actions: np.ndarray, *, motion: bool = False
 ) -> RecordedRollout:
     """Simulate actions, shape [T, A], and record target and scores if a problem is given."""
-    states, scores = [], []
+    states, scores, actions = [], [], np.asarray(actions)
+    if actions.shape != (len(actions), simulator.action_dim):
+        raise RenderError(f"actions must have the shape [T, {simulator.action_dim}], not {actions.shape}")
     simulator.set_contact("hard")
     simulator.reset()
     for step in range(len(actions) + 1):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from plab.config import Config
+from plab.config.compose import require_configs
 from plab.config.families import FAMILIES, Appearance, Family, Rule, family
 from plab.errors import ConfigError, PlabError, traceback_wanted
 from plab.plugins import load_object
@@ -59,6 +60,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
         ResultsError: If the results folder cannot be written, or another process is computing the run.
         RunError: If the run failed; its results so far are kept in the partial file.
     """
+    require_configs([cfg])
     track = Track(cfg, RunFile(cfg))
     _execute([track], "", cache)
     if track.error is not None:

@@ -161,7 +161,7 @@ class Policy:
                 "use its task, observe_particles and observe_target"
             )
         if self.mean is not None and self.variance is not None:
-            scaled = (observation - self.mean) / np.sqrt(self.variance + EPSILON)
+            scaled = (np.asarray(observation) - self.mean) / np.sqrt(self.variance + EPSILON)
             observation = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
         return self.network.predict(observation, deterministic=True)[0]
 

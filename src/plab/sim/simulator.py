@@ -167,9 +167,7 @@ class Simulator:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Raise TypeError: simulators cannot be copied or pickled."""
-        raise TypeError(
-            "a simulator cannot be copied or pickled: build another one and call set_state(state()) on it"
-        )
+        raise TypeError("simulators cannot be copied or pickled: build another, and use state and set_state")
 
     # -- settings -----------------------------------------------------------------------------------
 
