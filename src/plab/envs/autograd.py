@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import floating, simulator_input
@@ -61,8 +60,9 @@ class _Rollout(torch.autograd.Function):
         return torch.as_tensor(result.measures["loss"]).to(actions)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("rollout has no second derivatives: omit create_graph=True")
         (gradient,) = ctx.saved_tensors
         return loss_bar[:, None, None] * gradient, None, None
 
@@ -158,8 +158,9 @@ class _States(torch.autograd.Function):
         return tuple(torch.as_tensor(part).to(actions, copy=True) for part in shown)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *bars: torch.Tensor | None) -> tuple[Any, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("simulate has no second derivatives: omit create_graph=True")
         recording: RecordedStates = ctx.recording
         held = {
             name: simulator_input(bar, ctx.simulator)
