@@ -48,6 +48,7 @@ def test_help_all_names_everything(capsys):
 
 
 def test_cfg_job_prints_the_configuration(capsys, tmp_path):
+    assert main(["--cfg", "job", "seed=3", "--package", "seed"]) == 0 and capsys.readouterr().out == "3\n"
     assert main(["--cfg", "job", "seed=3"]) == 0
     out, err = capsys.readouterr()
     assert "seed: 3\n" in out and "precision: float32\n" in out and err == ""

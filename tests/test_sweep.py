@@ -73,9 +73,9 @@ def test_failed_runs_do_not_stop_the_others(sweep) -> None:
 
 
 def test_refused_runs_do_not_stop_the_others(sweep, capsys) -> None:
-    code, counts, lines = sweep("variant=1,9")
-    assert (code, counts) == (2, {"runs": 2, "finished": 1, "refused": 1})
-    assert len(lines) == 1 and "variant=9" in lines[0]
+    code, counts, lines = sweep("variant=1,9", "seed=0,1")
+    assert (code, counts) == (2, {"runs": 4, "finished": 2, "refused": 2})
+    assert len(lines) == 1 and "variant=9" in lines[0] and " and 1 more: " in lines[0]
     assert main(["-m", *COARSE, "variant=1,9"]) == 2
     assert capsys.readouterr().out.startswith("1 of 2 runs refused: ")
 
