@@ -208,7 +208,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 
 
 def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
-    for sql, named in (("select lr from runs", "lr"), ("select * from scores", "iterations")):
+    for sql, named in (("select lr from runs", "lr"), ("select * from scores", "config"), ("", "empty")):
         assert named in told(["sql", sql, str(folder)], main)
     sql = "select task, count(*) n, avg(seed) mean, null nil from runs group by task"
     assert main(["sql", sql, str(folder)]) == 0

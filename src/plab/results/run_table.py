@@ -368,7 +368,8 @@ def query(
         # Opening every file is slow, so it is done only for queries of this table.
         connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
         with connection:
-            answer = connection.execute(sql)
+            if (answer := connection.execute(sql)) is None:
+                raise ArgumentError("the query is empty; the tables are runs, config and iterations")
             return [column[0] for column in answer.description], answer.fetchall(), unreadable
     except duckdb.Error as error:
         # Omit hints and the marked position in the query.
