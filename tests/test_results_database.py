@@ -163,9 +163,8 @@ def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:
 
 
 def test_tables(folder: Path) -> None:
-    path = load(folder)["path"].iloc[0]
-    run = read(path)
     row = dict(load(folder).iloc[0])
+    run = read(path := row["path"])
     with closing(connect(folder, iterations=True)) as connection:
         table = connection.sql("SELECT * FROM runs WHERE seed = 0").df()
         (number,) = table["run"]
@@ -183,8 +182,8 @@ def test_tables(folder: Path) -> None:
         center = run.config["task"]["bodies"]["rope"]["center"]
         assert json.loads(settings["task.bodies.rope.center"]) == center
         assert settings["seed"] == "0" and settings["targets.source"] is None
-        rows = connection.sql(f"SELECT * FROM iterations {of_run} ORDER BY iteration").df()
-        pd.testing.assert_frame_equal(rows.drop(columns="run"), run.iterations)
+        rows = connection.sql(f"SELECT * EXCLUDE run FROM iterations {of_run} ORDER BY iteration").df()
+        pd.testing.assert_frame_equal(rows, run.iterations)
 
 
 def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:

@@ -127,9 +127,7 @@ def test_forms_of_output(folder: Path, told, capsys) -> None:
     arguments = [str(folder), "task=Rope", "variant=1"]
     # A line per group in files and pipes.
     assert main([str(folder), "seed=range(90)"]) == 0
-    assert re.search(
-        r"^Rope  adam  .*/180  .*interrupted, 1 failed, \d+ missing  ", capsys.readouterr().out, re.M
-    )
+    assert re.search(r"adam .*/180 .*, 1 failed, \d+ missing ", capsys.readouterr().out)
     assert main([*arguments]) == 0
     text, left_out = capsys.readouterr()
     assert "2/3" in text and "iteration 2: loss is nan" in text and "bad.h5" in left_out

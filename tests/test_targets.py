@@ -150,8 +150,7 @@ def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypa
         path.write_bytes(content)
         assert load_mass(path, 64) is None
     monkeypatch.setenv("PLAB_CACHE_DIR", str(path))
-    blocked = target_path(Recorder, rope, actions)
-    save_mass(blocked, mass)
+    save_mass(blocked := target_path(Recorder, rope, actions), mass)
     assert load_mass(blocked, 64) is None
 
 
