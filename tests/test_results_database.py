@@ -194,7 +194,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
             made.config["targets"]["source"] = "mine" if seed == 0 else None
             age(synthetic.save(made))
     pack(two, archive)
-    sources = [two, archive, one]
+    sources = [two, archive, one, one / "Rope-v1"]
     listed = "SELECT folder, seed, round(score, 9), targets FROM runs ORDER BY folder, seed"
     of_one = [(str(one), 0, 0.25, "mine"), (str(one), 1, 0.25, None)]
     # Loose files that are as good as each other all stay; what an archive has beside them does not.
