@@ -64,6 +64,5 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     assert re.search(r"/3 \d:\d\d:\d\d loss [\d.]+ \w+ score \d\.\d{3} best score [\d.]+", seen)
     *_, score, hint = capsys.readouterr().out.splitlines()
     assert score.startswith("finished: score 0.0000, results/Rope-v1/cem/seed0-")
-    assert f"plab render {score.rpartition(' ')[2]};" in hint
-    assert main([*argv, "progress=false"]) == 0
+    assert f"plab render {score.rpartition(' ')[2]};" in hint and main([*argv, "progress=false"]) == 0
     assert capsys.readouterr().out == f"finished before: {score.partition(': ')[2]}\n"

@@ -193,9 +193,8 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         options.source, own = best.path, best.values
         usual = Path(f"{own['task']}-v{own['variant']}-{own['method']}-seed{own['seed']}{ending}")
     elif len(sources) > 1 or (sources and words):
-        raise RenderError(
-            f"name either one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'"
-        )
+        given = " ".join(options.what)
+        raise RenderError(f"name either one result file or overrides (KEY=VALUE), not '{given}'")
     elif sources:
         (path,) = (options.source,) = sources
         usual = (Path() if split_archive(path) else path.parent) / (path.stem + ending)
@@ -222,7 +221,6 @@ def _size(text: str) -> tuple[int, int]:
     """Read a size such as 480x360; H.264 needs even numbers."""
     numbers = [int(number) for number in text.split("x") if number.isdecimal()]
     if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _MAX_FRAME_SIZE for number in numbers):
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_MAX_FRAME_SIZE}"
-        )
+        what = f"a size such as 480x360, of even numbers from 16 to {_MAX_FRAME_SIZE}"
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
     return numbers[0], numbers[1]
