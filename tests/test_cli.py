@@ -48,10 +48,10 @@ def test_help_all_names_everything(capsys):
 
 
 def test_cfg_job_prints_the_configuration(capsys, tmp_path):
+    assert main(["--cfg", "job", "seed=3", "--package", "seed"]) == 0 and capsys.readouterr().out == "3\n"
     assert main(["--cfg", "job", "seed=3"]) == 0
     out, err = capsys.readouterr()
-    assert "seed: 3\n" in out and "precision: float32\n" in out and err == ""
-    assert list(tmp_path.iterdir()) == []
+    assert "seed: 3\n" in out and "precision: float32\n" in out and err == "" and not [*tmp_path.iterdir()]
 
 
 def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_path):
@@ -59,8 +59,7 @@ def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_p
     (cfg,) = seen
     given = (cfg.task.name, cfg.variant, cfg.method.name, cfg.seed, cfg.method.lr)
     assert given == ("Move", "2", "gd", 7, 50)
-    assert Path.cwd() == tmp_path
-    assert list(tmp_path.iterdir()) == []
+    assert Path.cwd() == tmp_path and list(tmp_path.iterdir()) == []
 
 
 def test_sweeps_over_groups_with_keys_that_the_default_has_not(seen):

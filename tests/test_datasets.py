@@ -164,6 +164,7 @@ def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> N
     assert "exists" in told(again, main)
     assert "--min-score" not in told([*again, "--name", "a-v0", "--min-score", "2"], main)
     assert "observe" in told([*again, "--observe", "smell"], main)
+    assert "sim.horizon=50" in told([*again, "--output", str(tmp_path / "new"), "sim.horizon=9"], main)
     (tmp_path / "cameras.yaml").write_text("top: {place: 1}")
     assert "cameras.yaml" in told([*again, "--cameras", str(tmp_path / "cameras.yaml")], main)
     with pytest.raises(ConfigError, match="observe_target"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import gc
 import os
 import shutil
@@ -89,8 +90,7 @@ def test_a_finished_sweep_on_a_disk_that_is_read_only_ends_well(capsys) -> None:
         cfgs[1].path.with_suffix(suffix).write_bytes(cfgs[1].path.read_bytes())
     before = snapshot(Path())
     with watched(Path(), Failing(0, errno.EROFS, lasting=True)):
-        assert main(list(SWEEP)) == 0
-        assert status.main(["results", "task=Rope", "variant=1"]) == 0
+        assert main(list(SWEEP)) == 0 == status.main(["results", "task=Rope", "variant=1"])
         capsys.readouterr()
         assert main([*SWEEP, "seed=2,3"]) == 2
     out, err = capsys.readouterr()
@@ -102,18 +102,20 @@ def test_a_finished_sweep_on_a_disk_that_is_read_only_ends_well(capsys) -> None:
     assert_complete(cfgs)
 
 
-def test_damaged_files_are_computed_again_and_newer_ones_left_alone(capsys, caplog) -> None:
+def test_damaged_files_are_computed_again_and_newer_and_locked_ones_left_alone(capsys, caplog) -> None:
     assert main(list(SWEEP)) == 0
-    cut, newer = (cfg.path for cfg in configs()[:2])
+    cut, newer, locked = (cfg.path for cfg in configs())
     cut.write_bytes(cut.read_bytes()[:1000])
     with h5py.File(newer, "r+") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION + 1
-    before = newer.read_bytes()
+    before = newer.read_bytes(), locked.read_bytes()
     capsys.readouterr()
-    assert main(list(SWEEP)) == 2
+    with locked.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert main(list(SWEEP)) == 2
     err = capsys.readouterr().err
-    assert err.count("\n") == 1 and str(newer) in err
-    assert newer.read_bytes() == before and str(cut) in caplog.text
+    assert err.count("\n") == 2 and str(newer) in err and str(locked) in err
+    assert (newer.read_bytes(), locked.read_bytes()) == before and str(cut) in caplog.text
     aside = cut.with_name(f"{cut.name}.bad")
     assert aside.stat().st_size == 1000
     aside.unlink()

@@ -110,6 +110,8 @@ RUN = {
     "task=Assembly protocol.contact=soft method.contact_by_task.nearest.Assembly=3": "protocol.contact=soft",
     "method=gd protocol.numbers=release method.max_gradient_norm_by_numbers.plab=1": "numbers=release",
     "hydra/launcher=batch_joblib": "hydra/launcher=batch_joblib",
+    "hydra.job.chdir=true": "hydra.job.chdir",
+    "--cfg job --package targets.source": "targets.source",
     # sweeps
     "-m variant=1,2 task=Ropee": "did you mean Rope?",
     "-m seed=range(0)": "seed=range(0)",

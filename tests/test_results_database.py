@@ -163,9 +163,8 @@ def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:
 
 
 def test_tables(folder: Path) -> None:
-    path = load(folder)["path"].iloc[0]
-    run = read(path)
     row = dict(load(folder).iloc[0])
+    run = read(path := row["path"])
     with closing(connect(folder, iterations=True)) as connection:
         table = connection.sql("SELECT * FROM runs WHERE seed = 0").df()
         (number,) = table["run"]
@@ -183,8 +182,8 @@ def test_tables(folder: Path) -> None:
         center = run.config["task"]["bodies"]["rope"]["center"]
         assert json.loads(settings["task.bodies.rope.center"]) == center
         assert settings["seed"] == "0" and settings["targets.source"] is None
-        rows = connection.sql(f"SELECT * FROM iterations {of_run} ORDER BY iteration").df()
-        pd.testing.assert_frame_equal(rows.drop(columns="run"), run.iterations)
+        rows = connection.sql(f"SELECT * EXCLUDE run FROM iterations {of_run} ORDER BY iteration").df()
+        pd.testing.assert_frame_equal(rows, run.iterations)
 
 
 def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
@@ -195,7 +194,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
             made.config["targets"]["source"] = "mine" if seed == 0 else None
             age(synthetic.save(made))
     pack(two, archive)
-    sources = [two, archive, one]
+    sources = [two, archive, one, one / "Rope-v1"]
     listed = "SELECT folder, seed, round(score, 9), targets FROM runs ORDER BY folder, seed"
     of_one = [(str(one), 0, 0.25, "mine"), (str(one), 1, 0.25, None)]
     # Loose files that are as good as each other all stay; what an archive has beside them does not.
@@ -208,7 +207,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 
 
 def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
-    for sql, named in (("select lr from runs", "lr"), ("select * from scores", "iterations")):
+    for sql, named in (("select lr from runs", "lr"), ("select * from scores", "config"), ("", "empty")):
         assert named in told(["sql", sql, str(folder)], main)
     sql = "select task, count(*) n, avg(seed) mean, null nil from runs group by task"
     assert main(["sql", sql, str(folder)]) == 0

@@ -125,6 +125,9 @@ def test_rest_is_estimated_from_finished_runs_of_the_same_task_and_method(folder
 def test_forms_of_output(folder: Path, told, capsys) -> None:
     (folder / "bad.h5").write_bytes(b"")
     arguments = [str(folder), "task=Rope", "variant=1"]
+    # A line per group in files and pipes.
+    assert main([str(folder), "seed=range(90)"]) == 0
+    assert re.search(r"adam .*/180 .*, 1 failed, \d+ missing ", capsys.readouterr().out)
     assert main([*arguments]) == 0
     text, left_out = capsys.readouterr()
     assert "2/3" in text and "iteration 2: loss is nan" in text and "bad.h5" in left_out

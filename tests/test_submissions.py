@@ -249,8 +249,7 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
 
 def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Callable[..., str]) -> None:
     missing = str(tmp_path / "no")
-    empty = tmp_path / "empty"
-    empty.mkdir()
+    (empty := tmp_path / "empty").mkdir()
     for source in (missing, str(empty), "sim.device=cpu"):
         named = "name a submission" if "=" in source else source
         assert named in told([source], verify)

@@ -130,6 +130,8 @@ def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypa
     assert load_mass(path, 64) is None
     save_mass(path, mass)
     assert np.array_equal(load_mass(path, 64), mass)
+    # Other users of a shared cache can read it.
+    assert path.stat().st_mode & 0o777 == 0o666 & path.parent.stat().st_mode
     # The length of later episodes does not matter, all else does.
     assert target_path(Recorder, replace(rope, horizon=3), actions) == path
     assert target_path(Recorder, replace(rope, yield_stress=51.0), actions) != path
@@ -143,8 +145,7 @@ def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypa
         path.write_bytes(content)
         assert load_mass(path, 64) is None
     monkeypatch.setenv("PLAB_CACHE_DIR", str(path))
-    blocked = target_path(Recorder, rope, actions)
-    save_mass(blocked, mass)
+    save_mass(blocked := target_path(Recorder, rope, actions), mass)
     assert load_mass(blocked, 64) is None
 
 

@@ -14,10 +14,10 @@ import os
 import shutil
 import stat
 import sys
-import tempfile
+import uuid
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -76,15 +76,20 @@ def regular_file(path: Path) -> os.stat_result:
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder that replaces a missing or empty one when the ``with`` block succeeds."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder.parent))
+    """Yield an empty folder that replaces a missing or empty one when the ``with`` block succeeds; after an
+    error, leave no new folders."""
+    missing = [parent for parent in folder.parents if not parent.exists()]
+    # Not by tempfile, whose folders and files ignore the umask.
+    fresh = folder.with_name(f"{UNFINISHED}{uuid.uuid4().hex}")
+    fresh.mkdir(parents=True)
     try:
         yield fresh
-        fresh.chmod(0o755)
         fresh.rename(folder)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
+        with suppress(OSError):
+            for parent in missing:
+                parent.rmdir()
 
 
 # --------------------------------------------------------------------------------------------------- archives

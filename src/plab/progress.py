@@ -11,6 +11,7 @@ from datetime import timedelta
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 Report = Callable[[int, str], None]
 """Function of the number of finished steps and a short status text, which is empty between measurements."""
@@ -48,9 +49,12 @@ def show_progress(
     """
     watch, console = compiling or (lambda note: nullcontext()), Console()
     if enabled and console.is_terminal and multiprocessing.parent_process() is None:
-        bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()
-        columns = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
-        with Progress(next(columns), *bar, *columns, console=console, transient=not total) as bars:
+        # On a narrow terminal, the bar and the texts are shortened, not the numbers.
+        count, left = (Column(no_wrap=True, min_width=len(text)) for text in (f"{total}/{total}", "0:00:00"))
+        bar = BarColumn(), MofNCompleteColumn("/", count), TimeRemainingColumn(table_column=left)
+        name, text = (TextColumn(f"{{task.{key}}}", markup=False) for key in ("description", "fields[text]"))
+        columns = (name, text) if total is None else (name, *bar, text)
+        with Progress(*columns, console=console, transient=not total) as bars:
             task, shown = bars.add_task(title, total=total, completed=start, text=""), ""
 
             def note(kernel: str) -> None:

@@ -50,10 +50,8 @@ def main(argv: Sequence[str]) -> None:
     runs = collect(options.sources, select(options.words, NAMES), options.split)
     if runs.table.empty and options.what in ("notebooks", "html"):
         where = ", ".join(map(str, options.sources))
-        raise ResultsError(
-            f"{where} has no finished runs: start one with plab run task=Move, or show the bundled runs with "
-            "results=example"
-        )
+        advice = "start one with plab run task=Move, or show the bundled runs with results=example"
+        raise ResultsError(f"{where} has no finished runs: {advice}")
     out = options.output or Path("reports") / options.what
     command = shlex.join(["plab", "report", *argv])
     if options.what == "tables":

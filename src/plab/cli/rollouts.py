@@ -82,13 +82,11 @@ def view(argv: Sequence[str]) -> None:
       plab view task=Torus variant=2 --output torus.html
     """
     parser = _parser("plab view", view.__doc__, "the page")
-    what = (
-        ".html file (default: named after the result or the task); with --gallery a folder (default: gallery)"
-    )
+    what = ".html file (default: named after the result or the task); with --gallery a folder (default: "
+    what += "gallery)"
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
-    parser.add_argument(
-        "--gallery", action="store_true", help="frames of the best known actions of every task"
-    )
+    what = "frames of the best known actions of every task"
+    parser.add_argument("--gallery", action="store_true", help=what)
     what = "show plasticine as smooth surfaces instead of its particles"
     parser.add_argument("--surface", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -112,13 +110,12 @@ def view(argv: Sequence[str]) -> None:
         for task in (one for one in choices("task", options.config_dir) if one not in EXTENSION_TASKS):
             cfg = load_config([f"task={task}", *options.what], options.config_dir)
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
-            shown = page(recording, options.every, surface=options.surface)
-            replace_file(output.with_name(file), shown)
+            replace_file(output.with_name(file), page(recording, options.every, surface=options.surface))
             pages.append((task, file, recording.score))
         replace_file(output, html("gallery.html", "plab.view", pages=pages))
     else:
-        shown = page(record_with_motion(*rollout(options)), options.every, surface=options.surface)
-        replace_file(output, shown)
+        recording = record_with_motion(*rollout(options))
+        replace_file(output, page(recording, options.every, surface=options.surface))
     print(output)
 
 
@@ -139,9 +136,8 @@ def export(argv: Sequence[str]) -> None:
       plab export task=Torus variant=2 --format ply --output torus
     """
     parser = _parser("plab export", export.__doc__, "the series")
-    parser.add_argument(
-        "--format", choices=("vtk", "ply"), default="vtk", help="format of the files (default: vtk)"
-    )
+    what = "format of the files (default: vtk)"
+    parser.add_argument("--format", choices=("vtk", "ply"), default="vtk", help=what)
     what = "folder (default: named after the result or the task)"
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
     options = parser.parse_intermixed_args(argv)
@@ -197,9 +193,8 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         options.source, own = best.path, best.values
         usual = Path(f"{own['task']}-v{own['variant']}-{own['method']}-seed{own['seed']}{ending}")
     elif len(sources) > 1 or (sources and words):
-        raise RenderError(
-            f"name either one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'"
-        )
+        given = " ".join(options.what)
+        raise RenderError(f"name either one result file or overrides (KEY=VALUE), not '{given}'")
     elif sources:
         (path,) = (options.source,) = sources
         usual = (Path() if split_archive(path) else path.parent) / (path.stem + ending)
@@ -226,7 +221,6 @@ def _size(text: str) -> tuple[int, int]:
     """Read a size such as 480x360; H.264 needs even numbers."""
     numbers = [int(number) for number in text.split("x") if number.isdecimal()]
     if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _MAX_FRAME_SIZE for number in numbers):
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_MAX_FRAME_SIZE}"
-        )
+        what = f"a size such as 480x360, of even numbers from 16 to {_MAX_FRAME_SIZE}"
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
     return numbers[0], numbers[1]

@@ -38,7 +38,9 @@ def main(argv: Sequence[str]) -> int:
         shown = {name: config[name] for name in config if (name == "hydra") == (options.cfg == "hydra")}
         whole: Any = OmegaConf.create(shown, flags={"allow_objects": True})
         whole = OmegaConf.select(whole, options.package) if options.package else whole
-        print(OmegaConf.to_yaml(whole).rstrip())
+        if whole is None:
+            raise ConfigError(f"--package {options.package} is empty or does not exist")
+        print(OmegaConf.to_yaml(whole).rstrip() if OmegaConf.is_config(whole) else whole)
         return 0
     try:
         if (master := _sweep_settings(options, words)) is not None:
@@ -79,6 +81,8 @@ def _sweep_settings(options: Namespace, words: Sequence[str]) -> DictConfig | No
     # Folders for launcher logs; other keys may belong to a method or task other than the default.
     own += [one for key, one in by_key if key == "results_dir" and not one.is_sweep_override()]
     master = compose_with_hydra([str(one.input_line) for one in own], options.config_dir)
+    if master.hydra.job.chdir:
+        raise ConfigError("hydra.job.chdir=true would move results_dir: omit it")
     mode, values = str(master.hydra.mode), master.hydra.sweeper.params
     # An experiment with values is a sweep, unless hydra.mode says otherwise.
     if options.multirun or mode.endswith("MULTIRUN") or (mode == "None" and values):

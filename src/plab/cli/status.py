@@ -69,7 +69,7 @@ def duration(seconds: float) -> str:
 
 def show(found: Survey) -> None:
     """Print a table by task and method, running and failed runs, and totals."""
-    console = Console() if sys.stdout.isatty() else Console(width=80)
+    console = Console() if sys.stdout.isatty() else Console(width=200)
     table = _table("task", "method", "done", "not done", "score", "mean time", "time left")
     for group in found.groups.itertuples():
         mean = "" if math.isnan(group.mean_seconds) else duration(group.mean_seconds)

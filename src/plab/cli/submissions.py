@@ -80,7 +80,7 @@ def submit(argv: Sequence[str]) -> None:
         chosen = select(words, ("task", "variant", "method", "seed"))
         submission = Submission(card, tuple(from_sources(sources, chosen)))
     if fault := excess(submission):
-        raise SubmissionError(fault)
+        raise SubmissionError(f"{options.output}: {fault}")
     write(submission, options.output)
     configurations = {entry.configuration for entry in submission.entries}
     size = options.output.stat().st_size / 1e3
@@ -117,7 +117,7 @@ def verify(argv: Sequence[str]) -> int:
     if not sources:
         parser.error("name a submission file or a folder")
     if missing := [source for source in sources if not submission_files(source)]:
-        raise SubmissionError(f"{missing[0]} has no submissions, files <name>{SUFFIX}")
+        raise SubmissionError(f"there are no submissions, files <name>{SUFFIX}, at {missing[0]}")
     codes = []
     for path in (path for source in sources for path in submission_files(source)):
         try:

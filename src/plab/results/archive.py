@@ -67,9 +67,8 @@ def pack(
             if (other := packed.setdefault(name, row)) is not row:
                 raise ResultsError(f"{row.path} and {other.path} are runs of one configuration: remove one")
     if not packed:
-        raise ResultsError(
-            "there is nothing to pack: no run matches" + (f"; {unreadable[0]}" if unreadable else "")
-        )
+        why = f"; {unreadable[0]}" if unreadable else ""
+        raise ResultsError(f"there is nothing to pack: no run matches{why}")
     members = []
     for name, row in sorted(packed.items()):
         run = read(row.path)

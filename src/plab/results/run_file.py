@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -67,8 +68,8 @@ class ResultsError(PlabError, RuntimeError):
     """Unreadable or unwritable result file; the message names the file and the reason."""
 
 
-class NewerSchemaError(ResultsError):
-    """Result file with a newer schema version, which is never moved or replaced."""
+class IntactFileError(ResultsError):
+    """Result file with a newer schema version, or that cannot be accessed; it is never moved or replaced."""
 
 
 class RunBusyError(ResultsError):
@@ -347,7 +348,9 @@ def explained(path: Path) -> Iterator[None]:
     except ResultsError:
         raise
     except Exception as error:
-        raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
+        # Permissions, the lock of a program that writes, and stale handles of NFS are no damage.
+        kind = ResultsError if getattr(error, "errno", None) in (None, errno.ENOENT) else IntactFileError
+        raise kind(f"{path} cannot be read: {one_line(error)}") from error
 
 
 def _require_version(file: h5py.File, path: Path) -> None:
@@ -355,7 +358,7 @@ def _require_version(file: h5py.File, path: Path) -> None:
         raise ResultsError(f"{path} is not a plab result file")
     version = int(file.attrs["schema_version"])
     if version != SCHEMA_VERSION:
-        kind = NewerSchemaError if version > SCHEMA_VERSION else ResultsError
+        kind = IntactFileError if version > SCHEMA_VERSION else ResultsError
         why = f"has schema version {version}, this plab reads {SCHEMA_VERSION}"
         raise kind(f"{path} {why}: use the plab that wrote it, or choose another results_dir")
 

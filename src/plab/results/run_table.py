@@ -273,8 +273,8 @@ def _final(partial: Path) -> Path:
 def _without_repetitions(found: list[Row]) -> list[Row]:
     """Drop runs superseded by a finished run with the same configuration.
 
-    Among equivalent runs, all separate files are kept; without separate files, the first archived run is
-    kept.
+    Among equivalent runs, all separate files are kept, once if they are below several sources; without
+    separate files, the first archived run is kept.
     """
     by_hash: dict[str, list[Row]] = defaultdict(list)
     for row in found:
@@ -283,6 +283,8 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
     for same in by_hash.values():
         best = [row for row in same if row.values["status"] == "finished"] or same
         loose = [row for row in best if split_archive(row.path) is None]
+        if len(loose) > 1:
+            loose = list({row.path.resolve(): row for row in loose}.values())
         kept += loose or best[:1]
     return kept
 
@@ -368,7 +370,8 @@ def query(
         # Opening every file is slow, so it is done only for queries of this table.
         connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
         with connection:
-            answer = connection.execute(sql)
+            if (answer := connection.execute(sql)) is None:
+                raise ArgumentError("the query is empty; the tables are runs, config and iterations")
             return [column[0] for column in answer.description], answer.fetchall(), unreadable
     except duckdb.Error as error:
         # Omit hints and the marked position in the query.

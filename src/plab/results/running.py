@@ -34,7 +34,7 @@ from plab.files import one_line
 from plab.results.run_file import (
     PARTIAL_SUFFIX,
     REPLAY_SUFFIX,
-    NewerSchemaError,
+    IntactFileError,
     ResultsError,
     RunBusyError,
     RunResult,
@@ -61,7 +61,7 @@ class RunFile:
 
         Raises:
             RunBusyError: If another process is computing the run.
-            NewerSchemaError: If a file of the run was written by a newer version of plab.
+            IntactFileError: If a file of the run cannot be accessed, or was written by a newer plab.
             ResultsError: If the folder is not writable or the disk is full, before anything is computed.
         """
         config = config_dict(cfg)
@@ -198,7 +198,7 @@ class RunFile:
     def _finished_earlier(self) -> RunResult | None:
         try:
             earlier = read(self.path)
-        except NewerSchemaError:
+        except IntactFileError:
             raise
         except ResultsError:
             # Missing or damaged files are handled under the lock.
@@ -218,7 +218,7 @@ class RunFile:
                 earlier = read(path)
                 if earlier.config_hash != self.result.config_hash:
                     raise ResultsError(f"{path} belongs to another configuration")
-            except NewerSchemaError:
+            except IntactFileError:
                 raise
             except ResultsError as error:
                 names = (f"{path.name}.bad{number or ''}" for number in itertools.count())

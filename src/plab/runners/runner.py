@@ -12,7 +12,7 @@ import math
 import os
 import re
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
@@ -235,17 +235,20 @@ class Outcome:
 
 
 def report(outcomes: Sequence[Outcome], runs: int) -> int:
-    """Print a summary line of a sweep of some runs, and one line on standard error per outcome without a
-    result; return the exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
+    """Print a summary line of a sweep of some runs, and on standard error one line per reason why runs have
+    no result; return the exit code: 0 if all results exist, 2 for invalid input, otherwise 1."""
     count = Counter(one.status for one in outcomes)
     parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
     unfinished = ("failed", "refused", *_UNFINISHED)
     parts += [f"{count[status]} {_UNFINISHED.get(status, status)}" for status in unfinished if count[status]]
     parts += [f"{left} stopped"] if (left := runs - len(outcomes)) else []
     print(f"{runs} runs: {', '.join(parts)}", flush=True)
+    titles = defaultdict(list)
     for one in outcomes:
         if not one.finished:
-            print_error(f"{one.title}: {one.message}")
+            titles[one.message].append(one.title)
+    for message, (first, *others) in titles.items():
+        print_error(f"{first}{f' and {len(others)} more' if others else ''}: {message}")
     return 2 if count["refused"] else int(any(not one.finished for one in outcomes))
 
 

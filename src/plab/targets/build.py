@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 import pickle
-import tempfile
+import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
@@ -193,7 +193,8 @@ def save_mass(path: Path, mass: np.ndarray) -> None:
     # If the folder is not writable, the target is generated again each time.
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+        # Other users of a shared cache can read it, unlike a file by tempfile.
+        with path.with_name(f"{uuid.uuid4().hex}.tmp").open("wb") as file:
             np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
         os.replace(file.name, path)
 
