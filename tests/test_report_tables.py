@@ -224,14 +224,17 @@ def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> N
     assert look("adam lr=0.1").label == "Adam, lr 0.1"
     assert look("adam lr=0.1").colour != look("adam lr=0.01").colour
     tables = by_form(iou_tables(runs, "task"))
-    shown = tables["ours"].cells.iloc[0]
-    assert (shown["Adam, lr 0.01"], shown["Adam, lr 0.1"]) == ("0.80 ± 0.00", "0.40 ± 0.00")
+    assert [*tables["ours"].cells.iloc[0][["Adam, lr 0.01", "Adam, lr 0.1"]]] == [
+        "0.80 ± 0.00",
+        "0.40 ± 0.00",
+    ]
     # Both are compared with what the paper has for the method; the key is no setting that needs a note.
     compared = tables["comparison"].cells.set_index("method")["paper"]
     assert set(compared[["Adam, lr 0.01", "Adam, lr 0.1"]]) == {"0.59 ± 0.13"}
     assert "method.lr" not in tables["ours"].notes[-1]
-    assert "sim.grid_size" in told(["tables", str(tmp_path), "--split", "sim.grid_size"], main)
-    runs = gather(tmp_path, "task=Rope", "variant=1", "method.lr=0.1", split="seed")
+    for key in ("sim.grid_size", "seed_particles"):
+        assert f"differ in {key}" in told(["tables", str(tmp_path), "--split", key], main)
+    runs = gather(tmp_path, "task=Rope", "seed_particles=0", "method.lr=0.1", split="seed")
     assert [name for name in runs.methods if "seed" in name][:2] == ["adam seed=0", "adam seed=1"]
 
 

@@ -14,6 +14,9 @@ from plab.errors import ArgumentError, suggest
 OBSERVATION_KEYS = ("observe_particles", "observe_target")
 """Configuration keys that determine the entries of observations."""
 
+_PLAIN_KEYS = ("seed_scene", "seed_particles", *OBSERVATION_KEYS)
+"""Keys without a dot that select runs."""
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -21,7 +24,7 @@ class Selection:
 
     Attributes:
         choices: Allowed values as strings by name: ``task``, ``variant``, ``method``, ``seed`` etc.
-        keys: Required values by dotted configuration key: ``{"task.yield_stress": ["50.0"]}``.
+        keys: Required values by configuration key: ``{"task.yield_stress": ["50.0"]}``.
     """
 
     choices: dict[str, list[str]] = field(default_factory=dict)
@@ -36,7 +39,7 @@ class Selection:
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     """Parse selections from a command line, such as ``seed=0,1`` or ``seed=range(3)``, by ``names`` and
-    dotted keys of the configuration; raise ArgumentError or ConfigError if one is invalid."""
+    keys of the configuration; raise ArgumentError or ConfigError if one is invalid."""
     if not words:
         return Selection()
     # Imported here, because Hydra is slow to import and not needed without overrides.
@@ -47,11 +50,11 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     chosen = Selection()
     for override in parse(prepared(words)):
         name, word = override.key_or_group, override.input_line
-        if "." not in name and name not in names:
-            raise ArgumentError(f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key")
+        if "." not in name and name not in (known := (*names, *_PLAIN_KEYS)):
+            raise ArgumentError(f"'{word}' selects nothing; choose from: {', '.join(known)}, or a dotted key")
         if override.type is not OverrideType.CHANGE or override.package is not None:
             raise ArgumentError(f"'{word}' selects nothing: write name=value or name=value,value")
-        (chosen.keys if "." in name else chosen.choices)[name] = swept(override, choices(name))
+        (chosen.choices if name in names else chosen.keys)[name] = swept(override, choices(name))
     return chosen
 
 

@@ -173,8 +173,6 @@ def _split_value(row: Row, key: str, places: Sequence[Path]) -> Any:
         return row.values["seed"]
     if key == "folder":
         return next(str(place) for place in places if row.path.is_relative_to(place))
-    if "." not in key:
-        raise ArgumentError(f"cannot split by '{key}': use a dotted key such as method.lr, folder or seed")
     value = lookup(row.config, key)
     return value if isinstance(value, str | int | float) and value == value else json.dumps(value)
 
