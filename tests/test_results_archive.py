@@ -86,8 +86,7 @@ def test_unpacked_files_are_result_files(folder: Path, tmp_path: Path) -> None:
     assert names == {path.relative_to(folder) for path in folder.rglob("*.h5")} - {
         path.relative_to(folder) for path in folder.rglob("*.partial.h5")
     }
-    again = RunFile(synthetic.config(out))
-    assert again.finished
+    assert RunFile(synthetic.config(out)).finished
     with zipfile.ZipFile(io.BytesIO(lzma.decompress(archive.read_bytes()))) as members:
         assert {Path(name) for name in members.namelist()} == names
 
