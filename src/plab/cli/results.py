@@ -93,7 +93,7 @@ def _check(argv: Sequence[str]) -> int:
                 wrong += 1
                 runs += path.suffix == ".h5" and path.is_file()
                 print(printable(f"{path}: {fault}"), flush=True)
-    advice = "; delete the faulty .h5 files and run them again, or run them with force=true" if runs else ""
+    advice = "; damaged .h5 files can be deleted and run again, or run with force=true" if runs else ""
     print(f"{count} run(s) checked, {wrong} faulty{advice}")
     return 1 if wrong else 0
 
