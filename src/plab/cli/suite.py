@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from plab.config.compose import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.files import cache_dir
-from plab.objective import mass_change, target_sdf
+from plab.objective import Scores, mass_change, target_sdf
 from plab.problem import Problem, make_targets, require_alike
 from plab.sim import Simulator
 from plab.sweep.execution import sweep_configs
@@ -36,6 +37,16 @@ def by_task(overrides: Sequence[str]) -> dict[str, list[Config]]:
 # -------------------------------------------------------------------------------------------- demonstrations
 
 
+@dataclass(frozen=True)
+class ReplayedDemonstration:
+    """Actions, shape [T, A], their scores in the hard contact model, and the scores without motion."""
+
+    cfg: Config
+    actions: np.ndarray
+    scores: Scores
+    idle: Scores
+
+
 @command_line
 def demonstrations(argv: Sequence[str]) -> None:
     """Replay the best known actions of the suite and print their scores.
@@ -47,25 +58,28 @@ def demonstrations(argv: Sequence[str]) -> None:
     parser = Parser("plab demonstrations", demonstrations.__doc__)
     parser.add_argument("overrides", nargs="*", help=OVERRIDES)
     tasks = by_task(parser.parse_intermixed_args(argv).overrides).values()
+    replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
     judged = ["IoU at start", "IoU of target", "score", "score at rest"]
-    rows = (row for cfgs in tasks for row in _replayed(cfgs))
-    print_table(["task", "variant", "target", "steps", *judged], rows)
+    print_table(["task", "variant", "target", "steps", *judged], map(_row, replays))
 
 
-def _replayed(cfgs: Sequence[Config]) -> Iterator[list[str]]:
-    """Replay the known actions of configurations that fit into one batch, and yield their rows; without known
-    actions nothing moves."""
+def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None stands for no
+    motion."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
-    tried = np.stack([still if (known := known_actions(cfg)) is None else known for cfg in cfgs])
+    tried = np.stack([still if item is None else item for item in actions])
     reached = problem.rollout(tried, gradient=False).scores
     idle = problem.rollout(np.zeros_like(tried), gradient=False).scores
-    for cfg, actions, scores, at_rest in zip(cfgs, tried, reached, idle, strict=True):
-        steps = np.flatnonzero(np.abs(actions).max(axis=1) > 0).max(initial=-1) + 1
-        judged = scores.iou_initial, scores.iou_target_self, scores.score, at_rest.score
-        named = cfg.task.name, cfg.variant, cfg.task.target["recipe"], str(steps)
-        yield [*named, *(f"{number:.3f}" for number in judged)]
+    return [ReplayedDemonstration(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
+
+
+def _row(item: ReplayedDemonstration) -> list[str]:
+    steps = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0).max(initial=-1) + 1
+    named = [item.cfg.task.name, item.cfg.variant, item.cfg.task.target["recipe"], str(steps)]
+    judged = item.scores.iou_initial, item.scores.iou_target_self, item.scores.score, item.idle.score
+    return [*named, *(f"{number:.3f}" for number in judged)]
 
 
 # --------------------------------------------------------------------------------------------------- targets

@@ -37,6 +37,9 @@ from plab.report.tables import (
 )
 from plab.results.run_file import replace_file
 
+PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
+"""Phases of a run, with their colours."""
+
 
 @dataclass(frozen=True)
 class Drawing:
