@@ -25,7 +25,7 @@ def test_speed_prints_and_writes_complete_rows(
     monkeypatch.setattr(
         speed, "build", lambda *args: loads[-1] if loads else loads.append(workload.build(*args)) or loads[-1]
     )
-    command = [*COARSE_32, "--steps", "2", "--repeats", "1", "--batch", "2", "--csv", str(path)]
+    command = ["--steps", "2", "--repeats", "1", "--csv", str(path), "--batch", "2", *COARSE_32]
     assert speed.main([*command, "--kinds", FORWARD, ROLLOUT]) == 0
     rows = read(path)
     assert [(row["batch"], row["what"]) for row in rows] == [("2", FORWARD), ("2", ROLLOUT)]

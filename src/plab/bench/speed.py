@@ -110,7 +110,8 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     parser.add_argument("--paper", action="store_true", help="the paper's table next to ours")
-    options = parser.parse_intermixed_args(argv)
+    # Overrides first, because --batch and --kinds take several words.
+    options = parser.parse_intermixed_args(sorted(argv, key=lambda word: "=" not in word))
     cfgs = sweep_configs(options.overrides, {"task": suite_tasks() if options.paper else ["Move"]})
     # Taichi restarts for each precision, so precision is the outer loop.
     cells = list(itertools.product(sorted(cfgs, key=lambda cfg: cfg.sim.precision), options.batch))
