@@ -372,6 +372,8 @@ def test_environments_that_cannot_be_are_refused(monkeypatch: pytest.MonkeyPatch
             plab.make(*arguments)
     with pytest.raises(ValueError, match="render_mode 'ansi'"):
         PlabEnv("Move", render_mode="ansi")
+    with pytest.raises(ValueError, match="render_size must be a width and a height"):
+        PlabEnv("Move", render_size=480)
     cfgs = [load_config(["task=Move", *COARSE, *own]) for own in ((), ["sim.horizon=3"])]
     with pytest.raises(ConfigError, match=r"sim\.horizon"):
         core.EpisodeBatch(cfgs)

@@ -243,7 +243,6 @@ def test_parameters_are_differentiated_and_limit_the_time_step(name: str) -> Non
 def compiled(device: str, precision: str, law: Law, mixed: bool = False):
     """Function that calls a law's bitcode functions by name with arrays."""
     llvm = pytest.importorskip("llvmlite.binding")
-    llvm.initialize()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     host = llvm.Target.from_default_triple().create_target_machine(opt=0)

@@ -322,7 +322,7 @@ def test_scores_are_means_of_whole_tables_within_budgets(leaders) -> None:
 
 
 def test_what_does_not_belong_is_left_out_with_a_reason(leaders, folder: Path) -> None:
-    reasons = {"believed": "recursion", "deep": "recursion", "foreign": "target of Move-v1"}
+    reasons = {"believed": "decoding a JSON", "deep": "decoding a JSON", "foreign": "target of Move-v1"}
     reasons |= {"liar": "1 claim", "recording": "card", "rubbish": "zip"}
     for line, (name, reason) in zip(sorted(leaders[1]), reasons.items(), strict=True):
         assert line.startswith(str(folder / f"{name}.")) and reason in line

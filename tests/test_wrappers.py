@@ -51,7 +51,7 @@ def vector(request):
 def pictured():
     """An environment and a vector environment whose observations are pictures."""
     how = {"overrides": COARSE, "observe": "rgb", "render_mode": "rgb_array", "render_size": (64, 48)}
-    envs = plab.make("Move", **how), plab.make_vec("Move", num_envs=2, **how)
+    envs = plab.make("Move", **how), plab.make_vec("Move", 2, **how)
     yield envs
     for env in envs:
         env.close()

@@ -32,7 +32,7 @@ def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any,
 
 
 def make_vec(
-    task: str, variant: str | int = 1, num_envs: int = 1, **kwargs: Any
+    task: str, num_envs: int = 1, *, variant: str | int = 1, **kwargs: Any
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """Create several environments of the suite that share one simulator.
 

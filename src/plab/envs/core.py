@@ -228,7 +228,7 @@ class EpisodeBatch:
             render_target: Whether pictures show the target as a translucent shape.
 
         Raises:
-            ValueError: If the contact model or an observation does not exist.
+            ValueError: If the contact model or an observation does not exist, or ``render_size`` is invalid.
             plab.config.ConfigError: If the configurations are incompatible, or a range is invalid.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes cannot share a simulator.
             plab.targets.TargetError: If a target cannot be built.
@@ -236,6 +236,8 @@ class EpisodeBatch:
             RuntimeError: If this process was forked from one with environments.
         """
         ranges.one_of("contact", contact, CONTACTS)
+        if np.shape(render_size) != (2,) or not all(map(is_whole, render_size)):
+            raise ValueError(f"render_size must be a width and a height in pixels, not {render_size}")
         self._randomize, self._success_score = randomize, success_score
         self.terminates, self._goes_by_stages = terminate_on_success, stages
         cfgs = self._ranged(cfgs)

@@ -116,14 +116,17 @@ def load(
         :attr:`RunResult.score`.
 
     Raises:
-        ResultsError: As for :func:`rows`, or if ``keys`` is a string.
+        ResultsError: As for :func:`rows`, or if ``keys`` is a string, or no run has one of them.
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys must be a list of dotted keys, such as ['{keys}'], not the string '{keys}'")
     found, unreadable = rows(source, index=index)
     warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
-    return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
+    loaded = pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
+    if strange := [key for key in keys if table and loaded[key].isna().all()]:
+        raise ResultsError(f"no run has '{strange[0]}': use dotted keys, such as method.lr")
+    return loaded
 
 
 def warn_of(unreadable: Sequence[ResultsError]) -> None:

@@ -1,9 +1,9 @@
 """Compiler of the kernels: Taichi, or Quadrants, its fork with wheels for Python 3.14, and patches of both.
 
-Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025) and
-Quadrants 1.3.3; pyproject.toml lists the supported versions. Each function documents its changes and their
-reason. The standard library is changed only while Taichi is imported. :mod:`plab.sim` imports this module
-before any kernel is defined, as it changes Taichi's decorators.
+Only this module imports them or uses undocumented interfaces. Written for Taichi 1.7.4 (July 2025),
+Quadrants 1.3.3 and 1.4.0; pyproject.toml lists the supported versions. Each function documents its changes
+and their reason. The standard library is changed only while Taichi is imported. :mod:`plab.sim` imports this
+module before any kernel is defined, as it changes Taichi's decorators.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ if QUADRANTS:
     import quadrants as ti
     from quadrants.lang import impl
     from quadrants.lang._func_base import FuncBase as _traced
+    from quadrants.lang.expr import make_expr_group
     from quadrants.lang.kernel import Kernel
-    from quadrants.lang.source_builder import SourceBuilder
 
     _TRACE = "get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.mem_fence
@@ -46,8 +46,8 @@ else:
     from taichi.lang import _ndarray, impl, matrix
     from taichi.lang import kernel_impl as _traced
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    from taichi.lang.expr import make_expr_group
     from taichi.lang.kernel_impl import Kernel
-    from taichi.lang.source_builder import SourceBuilder
     from taichi.lang.util import to_taichi_type
 
     _TRACE = "_get_tree_and_ctx"
@@ -313,9 +313,16 @@ def bitcode_function(path: str, symbol: str) -> Callable[..., None]:
     """Return a function from an LLVM bitcode file, which Taichi links into kernels; its arguments are local
     variables.
 
-    Sets ``SourceBuilder.bc`` and ``mode`` directly, because the public interface compiles C++ with clang.
+    Calls ``insert_external_func_call``, because the public interface of Taichi compiles C++ with clang, and
+    Quadrants 1.4 has none.
     """
-    source = SourceBuilder()
-    source.bc, source.mode = path, "bc"
-    found: Callable[..., None] = getattr(source, symbol)
-    return found
+
+    def call(*variables: Any) -> None:
+        runtime = impl.get_runtime()
+        builder = runtime.compiling_callable.ast_builder()
+        inputs, outputs = make_expr_group(variables), make_expr_group(())
+        position = ti._lib.core.DebugInfo(runtime.get_current_src_info())
+        builder.insert_external_func_call(0, "", path, symbol, inputs, outputs, position)
+
+    call.__module__ = impl.__name__  # the tracer warns of functions outside its package
+    return call
