@@ -465,7 +465,8 @@ def _connected(
         curves = read_curves(row.path for row in found)
         frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves) if columns]
         tables["iterations"] = pd.concat(frames or [table[["run"]][:0]])
-    connection = duckdb.connect()
+    # With several threads, DuckDB misses some Ctrl-C's, and the query never ends.
+    connection = duckdb.connect(config={"threads": 1})
     for name, frame in tables.items():
         connection.register("frame", frame)
         connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
