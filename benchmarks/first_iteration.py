@@ -25,7 +25,9 @@ COMMANDS = {
 
 def seconds(checkout: str, words: list[str], cache: str, line: str = "") -> tuple[float, float]:
     """Time a command, up to its first line of output that contains ``line`` if given: wall and CPU time."""
-    caches = {"PLAB_CACHE_DIR": f"{cache}/plab", "TI_OFFLINE_CACHE_FILE_PATH": f"{cache}/taichi"}
+    caches = {"PLAB_CACHE_DIR": f"{cache}/plab"} | {
+        f"{compiler}_OFFLINE_CACHE_FILE_PATH": f"{cache}/kernels" for compiler in ("TI", "QD")
+    }
     env = os.environ | caches | {"PYTHONPATH": f"{Path(checkout).resolve()}/src"}
     begin = time.perf_counter()
     child = subprocess.Popen([sys.executable, *words], env=env, cwd=cache, stdout=subprocess.PIPE, text=True)
