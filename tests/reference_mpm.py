@@ -224,8 +224,7 @@ def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:
 
 
 def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3] of the nodes
-    around each particle."""
+    """Indices [particle, 27, 3], weights [particle, 27], offsets [particle, 27, 3] of its nodes."""
     base = x.detach() / scene.dx - 0.5
     base = base.trunc() if scene.floor_stencil == "release" else base.floor()
     fx = x / scene.dx - base

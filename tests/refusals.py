@@ -1,5 +1,4 @@
-"""Checks of refusals: an error with one line, or exit code 2, one line on standard error and nothing on
-standard output."""
+"""Checks of refusals: an error with one line, or exit code 2 and one line on standard error only."""
 
 from __future__ import annotations
 

@@ -159,8 +159,7 @@ def assert_same_state(got: State, e: int, want: reference.State) -> None:
 
 
 def make_not_finite(simulator: Simulator, env: int) -> None:
-    """Give a particle of an environment a velocity that is not a number, which set_state() refuses; steps
-    are counted from here."""
+    """Set a particle's velocity to NaN, which set_state() refuses; steps are counted from here."""
     state, particles = simulator.state(), simulator._particles
     state.v[env, 5] = np.nan
     particles.current.from_numpy(particles.pack(state))

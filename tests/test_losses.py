@@ -79,11 +79,8 @@ def test_terms_that_do_not_exist_are_named() -> None:
     ):
         with pytest.raises(ConfigError, match=named):
             load_config(overrides)
-    for own, named in (
-        ("no_module:Term", "no_module"),
-        ("plab.losses.density:Dense", "Dense"),
-        ("plab.objective:Scores", "Scores"),
-    ):
+    owns = {"no_module:Term": "no_module", "plab.losses.density:Dense": "Dense"}
+    for own, named in (owns | {"plab.objective:Scores": "Scores"}).items():
         with pytest.raises(ConfigError, match=named):
             make_terms({"own": 1.0}, {"own": own})
 
@@ -116,12 +113,19 @@ def test_a_term_of_ones_own_is_a_file_and_a_weight(tmp_path: Path, monkeypatch, 
     assert [problem for _, problem in check(tmp_path / "results")] == [""]
 
 
-def test_a_wrong_gradient_is_noticed(device: str) -> None:
+def test_a_wrong_measure_or_gradient_is_noticed(device: str) -> None:
     class Wrong(Kinetic):
         @ti.func
         def gradient(self, e, x, v):
             return 2.0 * ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
 
+    class Vector(Kinetic):
+        @ti.func
+        def measure(self, e, x, v):
+            return v
+
+    with pytest.raises(Exception, match="Tensor"):
+        check_gradient(Vector(), with_tools("Sphere"), device=device)
     errors = check_gradient(Wrong(), with_tools("Sphere"), device=device, directions=1)
     assert errors["x"] == pytest.approx(0.5) and max(errors["v"], errors["poses"]) < 1e-6
 
@@ -214,9 +218,8 @@ def test_the_way_back_is_refused_once_it_is_gone(full: Simulator) -> None:
         full.state_gradient()
     with pytest.raises(TypeError, match="'y'"):
         simulate(full, u, y=u)
-    recording = full.record(np.zeros((2, 1, full.action_dim)))
     with pytest.raises(ValueError, match=r"to v .*\(2, 1\)"):
-        recording.pullback(v=np.zeros((2, 1)))
+        full.record(np.zeros((2, 1, full.action_dim))).pullback(v=np.zeros((2, 1)))
     full.reset()
     broken = full.state()
     broken.v[0, 0] = 1e9

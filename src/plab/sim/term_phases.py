@@ -164,7 +164,8 @@ class TermPhases(Storage):
             empty = mass == 0.0
         if self.in_tensor(node) and not empty:
             for k, column, term in ti.static(self.node_terms):
-                values[k] = ti.cast(term.measure(e, node, mass), ti.f64)
+                # Not =, with which Taichi aborts if a user's term returns a vector.
+                values[k] += ti.cast(term.measure(e, node, mass), ti.f64)
                 if ti.static(term.weighted):
                     slope += self.term_weights[column] * term.slope(e, node, mass)
         values[ti.static(len(self.node_terms))] = ti.cast(mass, ti.f64)
@@ -174,7 +175,7 @@ class TermPhases(Storage):
     def particle_measures(self, e, x, v):
         values = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
         for k, _column, term in ti.static(self.particle_terms):
-            values[k] = ti.cast(term.measure(e, x, v), ti.f64)
+            values[k] += ti.cast(term.measure(e, x, v), ti.f64)
         return values
 
     @ti.func
