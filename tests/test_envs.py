@@ -186,8 +186,7 @@ def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVe
         state, copied = one.get_state(), duplicate(one)
         wanted = [one.step(action) for action in actions[2:]]
         assert copied.spec == one.spec
-        again = one.set_state(state)
-        assert data_equivalence(again, copied.set_state(copied.get_state()), exact=True)
+        assert data_equivalence(one.set_state(state), copied.set_state(copied.get_state()), exact=True)
         assert copied.np_random.random() == one.np_random.random()
         assert data_equivalence(wanted, [one.step(action) for action in actions[2:]], exact=True)
         assert data_equivalence(wanted, [copied.step(action) for action in actions[2:]], exact=True)

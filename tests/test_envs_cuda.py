@@ -104,8 +104,7 @@ def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
         assert done.loss.device.type == device
         gradients.append(torch.cat([one.grad.flatten() for one in policy.parameters()]).cpu().numpy())
         episodes.close()
-    scale = np.abs(gradients[0]).max()
-    np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-8 * scale)
+    np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-8 * np.abs(gradients[0]).max())
 
 
 def test_a_recorded_update_reads_its_arguments_and_what_it_changes() -> None:

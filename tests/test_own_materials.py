@@ -30,8 +30,7 @@ def example(*overrides: str) -> Config:
 
 
 def test_the_page_shows_the_example_and_its_commands_are_runs_of_it(seen, tmp_path, monkeypatch):
-    cushion = (CONF / "task" / "Cushion.yaml").read_text(encoding="utf-8")
-    assert blocks(PAGE, "yaml")[0] in cushion
+    assert blocks(PAGE, "yaml")[0] in (CONF / "task" / "Cushion.yaml").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     for line in blocks(PAGE, "bash")[0].splitlines():
         assert main(arguments(line)) == 0

@@ -268,8 +268,7 @@ def test_a_run_improves_on_its_start_and_tells_what_it_cost(finished, method: st
     assert best["score"] == rows["score"].max() and best["loss"] == result.best_loss
     for name in ("loss", "loss_sdf", "reward", "iou"):
         assert best[name] == pytest.approx(final[name], rel=1e-6), name
-    worst = int(rows["score"].argmin())
-    assert "the best" in faults(replace(result, best_iteration=worst))[0]
+    assert "the best" in faults(replace(result, best_iteration=int(rows["score"].argmin())))[0]
     # In the soft model each of two updates, and before them a judgement in the hard one, which needs none.
     spent = {"multistart": [4, 8], "hybrid": [4, 4], "solve": [4, 6]}.get(method, [4, 0])
     assert rows[list(BUDGETS)].iloc[-1].tolist() == [4 * STEPS * n for n in spent]

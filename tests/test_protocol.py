@@ -103,8 +103,7 @@ def test_masses_rotations_and_the_floor_of_a_simulator(simulator: Simulator) -> 
         np.testing.assert_allclose(got[e], want, atol=1e-15)
         assert got[e].min() < 0.0
         np.testing.assert_allclose(got[e].sum(), world.particle_count * world.particle_mass)
-    pin = KINDS.index("RollingPin")
-    assert (simulator.poses()[:, pin, 3:7] == [0.707, 0.707, 0.0, 0.0]).all()
+    assert (simulator.poses()[:, KINDS.index("RollingPin"), 3:7] == [0.707, 0.707, 0.0, 0.0]).all()
     simulator.step(np.full((len(SCENES), SCENES[0].action_dim), 0.5))
     np.testing.assert_allclose(np.linalg.norm(simulator.poses()[..., 3:7], axis=-1), 1.0, atol=1e-14)
     with pytest.raises(SceneError, match=r"scene 0 .*plab"):

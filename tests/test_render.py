@@ -20,9 +20,10 @@ from plab.cli.rollouts import render as main
 from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.objective import spread_mass
+from plab.problem import Problem
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
-from plab.render.rollouts import record
+from plab.render.rollouts import next_problem, record, record_with_motion
 from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.sim.cameras import CameraSensor
@@ -44,7 +45,7 @@ if missing is None:
     from PIL import Image
 
     from plab.render import Renderer
-    from plab.render.pictures import save
+    from plab.render.pictures import draw_runs, save
 
 
 def scene(*manipulators: Manipulator, bodies: tuple[Body, ...] = (CUBE,)) -> Scene:
@@ -118,8 +119,7 @@ def test_the_camera_of_a_scene_sees_manipulators_and_target():
     seen = camera.project(np.array([SPHERE.position, GHOST, CUBE.center]))
     assert np.all((seen > 0) & (seen < SIZE))
     assert set(suite_tasks()) == set(VIEWS)
-    unknown = dataclasses.replace(scene(SPHERE), name="Own")
-    assert math.isfinite(sum(scene_camera(unknown).position))
+    assert math.isfinite(sum(scene_camera(dataclasses.replace(scene(SPHERE), name="Own")).position))
 
 
 # ----------------------------------------------------------------------------------------------------- frames
@@ -193,14 +193,13 @@ def test_the_target_is_a_ghost_that_vanishes_where_it_is_reached_or_drawn_alone(
 
 @pytest.fixture(scope="module")
 def recording():
-    return record(load_config(["task=Rope", *COARSE]), np.full((3, 6), 0.5))
+    return record_with_motion(load_config(["task=Rope", *COARSE]), np.full((3, 6), 0.5))
 
 
 def test_a_recording_holds_the_start_and_every_step(recording):
     assert recording.x.shape == (4, recording.scene.particle_count, 3)
     assert recording.poses.shape == (4, 3, 8)
-    moved = recording.poses[:, 0, 0] - recording.poses[0, 0, 0]
-    assert moved == pytest.approx(0.5 * 0.01 * np.arange(4))
+    assert recording.poses[:, 0, 0] - recording.poses[0, 0, 0] == pytest.approx(0.5 * 0.01 * np.arange(4))
     scores = recording.scores
     assert scores.shape == (4,) and scores[0] == 0 and recording.score == scores[3]
     assert np.all((scores >= 0) & (scores <= 1))
@@ -223,6 +222,20 @@ def test_films_as_gif_and_mp4(recording):
     # The last one is held for a second.
     assert (tuple(meta["size"]), meta["fps"], len(frames)) == (SIZE, 20.0, 4 + 19)
     assert frames[0].std() > 10
+
+
+def test_runs_of_a_task_share_a_simulator():
+    wanted, cfgs = {}, [load_config(["task=Rope", f"variant={number}", *COARSE]) for number in "12"]
+    for cfg in cfgs:
+        run = results.RunResult(results.config_dict(cfg), cfg.hash, best_actions=np.full((3, 6), 0.5))
+        results.write(run, Path(cfg.variant, "run.h5"))
+        wanted[Path(f"Rope-v{cfg.variant}")] = Path(cfg.variant, "run.h5"), False
+    draw_runs(wanted, lambda: None)
+    assert len(list(Path.cwd().glob("Rope-v[12]/*.webp"))) == 6
+    first = Problem(cfgs[:1])
+    problem = next_problem(cfg, (cfgs[0], first))
+    assert problem.simulator is first.simulator
+    np.testing.assert_array_equal(record(cfg, run.best_actions, problem).x, record(cfg, run.best_actions).x)
 
 
 # ----------------------------------------------------------------------------------------------- command line

@@ -24,8 +24,7 @@ def folder(tmp_path: Path) -> Path:
     results = tmp_path / "results"
     mass = np.zeros((64, 64, 64))
     mass[3, 4, 5:9] = 0.5
-    first = synthetic.run(results)
-    synthetic.save(dataclasses.replace(first, masses={"final": mass}))
+    synthetic.save(dataclasses.replace(synthetic.run(results), masses={"final": mass}))
     synthetic.save(synthetic.run(results, method="ppo", task="Move", variant="3", seed=2))
     stopped = dataclasses.replace(synthetic.run(results, seed=1), status="stopped", evaluation={})
     synthetic.save(dataclasses.replace(stopped, resume={"state": np.arange(3.0)}))

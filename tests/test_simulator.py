@@ -256,8 +256,7 @@ def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
     cells = np.indices((8, 8, 8)).reshape(3, -1).T
     index = hilbert_index(cells, 3)
     assert sorted(index) == list(range(512))
-    way = cells[np.argsort(index)]
-    assert (np.abs(np.diff(way, axis=0)).sum(axis=1) == 1).all()
+    assert (np.abs(np.diff(cells[np.argsort(index)], axis=0)).sum(axis=1) == 1).all()
     # Particles outside the lowest nodes are put in order, too.
     x = np.random.default_rng(0).random((500, 3)) * (1 - 3 / 16)
     x[:8] = np.indices((2, 2, 2)).reshape(3, -1).T * (1 - 3 / 16)

@@ -329,8 +329,7 @@ def test_what_does_not_belong_is_left_out_with_a_reason(leaders, folder: Path) -
 
 
 def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, tmp_path: Path) -> None:
-    found = read_verification(read(folder / "plans.plabsub.zip"))
-    assert {one.outcome for one in found} == {HOLDS}
+    assert {one.outcome for one in read_verification(read(folder / "plans.plabsub.zip"))} == {HOLDS}
     kept = json.loads((folder / "plans.verified.json").read_text())
     assert kept["tolerance"] == TOLERANCE and kept["entries"][1]["score"] == 0.8
     for path in folder.glob("plans.*"):

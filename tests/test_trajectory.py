@@ -256,8 +256,7 @@ def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatc
             raise OSError("no\nanswer")
         return log
 
-    fake = SimpleNamespace(init=init, Settings=dict, Error=OSError)
-    monkeypatch.setitem(sys.modules, "wandb", fake)
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init, Settings=dict, Error=OSError))
     monkeypatch.delenv("WANDB_PROJECT", raising=False)
     cfg = make_config(tmp_path, "logger=wandb")
     run = SimpleNamespace(path=cfg.path, result=SimpleNamespace(config={"seed": 0}))

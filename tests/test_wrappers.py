@@ -158,8 +158,7 @@ def test_goals_agree_with_hindsight() -> None:
     assert env.observation_space.contains(first) and first["achieved_goal"].sum() == pytest.approx(1.0)
     seen, reward, *_ = env.step(np.ones(6))
     pairs = (np.stack([seen[name]] * 2) for name in ("achieved_goal", "desired_goal"))
-    again = env.compute_reward(*pairs, {})
-    assert again == pytest.approx([reward] * 2) and -1.0 <= reward < 0.0
+    assert env.compute_reward(*pairs, {}) == pytest.approx([reward] * 2) and -1.0 <= reward < 0.0
     assert env.compute_reward(seen["achieved_goal"], seen["achieved_goal"], {}) == 0.0
     # The goal is where the target is, in every episode.
     center = env.unwrapped.batch.configs[0].task.target["bodies"]["ball"]["center"]

@@ -12,13 +12,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from plab.config import Config
 from plab.errors import PlabError
 from plab.files import UNFINISHED, complete_folder
+from plab.problem import Problem
 from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
-from plab.render.rollouts import RecordedRollout, record, result
+from plab.render.rollouts import RecordedRollout, next_problem, record, result
 from plab.results.run_file import replace_file
 
 STEPS_PER_SECOND = 20
@@ -143,7 +145,7 @@ def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
 
 
 def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None]) -> None:
-    """Render runs, see :func:`save_set`; runs with films come first.
+    """Render runs, see :func:`save_set`, in the order of their folders.
 
     Args:
         wanted: Result file, and whether to make a film, by folder. Folders must not exist, and appear when
@@ -156,15 +158,17 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
     """
     require_graphics()
     troubles: list[str] = []
+    before: tuple[Config, Problem] | None = None
     for place in {folder.parent for folder in wanted}:
         # Leftover pictures of killed processes.
         for folder in place.glob(f"{UNFINISHED}*"):
             shutil.rmtree(folder, ignore_errors=True)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
-        for number, folder in enumerate(sorted(wanted, key=lambda one: not wanted[one][1]), start=1):
-            path, film = wanted[folder]
+        for number, (folder, (path, film)) in enumerate(sorted(wanted.items()), start=1):
             try:
-                recording = record(*result(path))
+                cfg, actions = result(path)
+                before = cfg, next_problem(cfg, before)
+                recording = record(cfg, actions, before[1])
             except PlabError as error:
                 troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.errors import print_error
-from plab.problem import Problem, make_simulator
+from plab.errors import ConfigError, print_error
+from plab.problem import Problem, build_scenes, make_simulator, require_alike
 from plab.render.graphics import RenderError
 from plab.results import read
-from plab.scenes import Scene
+from plab.scenes import Scene, SceneError
 from plab.sim import Simulator
 from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
@@ -34,7 +35,8 @@ class RecordedRollout:
         target_mass: Mass tensor of the target, shape [n, n, n]; None if it is not available.
         x: Particle positions [domain units] initially and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
-        scores: Scores of these states, shape [T + 1]; None without a target.
+        scores: Scores of these states, shape [T + 1], without motion of the last one only, shape [1]; None
+            without a target.
         v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
         F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
@@ -116,10 +118,23 @@ def demonstration(cfg: Config) -> np.ndarray:
     return actions
 
 
-def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
-    """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
-    problem = Problem([cfg])
+def record(cfg: Config, actions: np.ndarray, problem: Problem | None = None) -> RecordedRollout:
+    """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration, or in its problem
+    if that has been built."""
+    problem = problem or Problem([cfg])
     return _recording(cfg, problem.simulator, problem, actions)
+
+
+def next_problem(cfg: Config, before: tuple[Config, Problem] | None) -> Problem:
+    """Return a configuration's problem, with the simulator of the one before if both scenes are of the same
+    kind, which saves compiling."""
+    if before is not None:
+        simulator = before[1].simulator
+        with suppress(ConfigError, SceneError):
+            require_alike([before[0], cfg])
+            simulator.set_scenes(build_scenes([cfg]))
+            return Problem([cfg], simulator)
+    return Problem([cfg])
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
@@ -150,7 +165,7 @@ def _recording(
         if step > 0:
             simulator.step(actions[None, step - 1])
         states.append(simulator.state())
-        if problem is not None:
+        if problem is not None and (motion or step == len(actions)):
             scores.append(problem.scores(simulator.mass_tensor())[0].score)
     names = ("x", "poses", *(("v", "F") if motion else ()))
     return RecordedRollout(
