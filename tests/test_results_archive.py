@@ -127,12 +127,12 @@ def test_iterations_can_be_rounded(folder: Path, tmp_path: Path) -> None:
     archive = tmp_path / "all.plab.zip.xz"
     assert main(["pack", str(folder), "--digits", "3", "--output", str(archive)]) == 0
     loose, packed = load(folder).query("status == 'finished'"), load(archive)
-    for a, b in zip(loose["path"], packed["path"], strict=True):
-        one, other = read(a), read(b)
+    for one, other in zip(map(read, loose["path"]), map(read, packed["path"]), strict=True):
         changed = one.iterations != other.iterations
         assert changed["loss"].any() and not changed["iteration"].any()
         pd.testing.assert_frame_equal(one.iterations, other.iterations, rtol=0.5e-2)
         assert other.best_loss == other.iterations["loss"].min()
+        assert {name: float(f"{value:.3g}") for name, value in one.wall_time.items()} == other.wall_time
     assert main(["check", str(archive)]) == 0
     assert main(["pack", str(folder), "--digits", "400", "--output", str(tmp_path / "b.plab.zip.xz")]) == 0
     assert (tmp_path / "b.plab.zip.xz").stat().st_size > archive.stat().st_size

@@ -43,8 +43,8 @@ def pack(
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
         chosen: Selection of runs; None: all.
-        digits: Minimum number of significant digits of the iterations, >= 1; None: all. Four digits reduce
-            the size by two thirds. Actions and the final evaluation keep all digits.
+        digits: Minimum number of significant digits of the iterations and wall times, >= 1; None: all. Four
+            digits reduce the size by two thirds. Actions and the final evaluation keep all digits.
 
     Returns:
         Number of runs in the archive, and the errors of unreadable files, which are omitted.
@@ -70,7 +70,8 @@ def pack(
         why = f"; {unreadable[0]}" if unreadable else ""
         raise ResultsError(f"there is nothing to pack: no run matches{why}")
     members = []
-    for name, row in sorted(packed.items()):
+    # Runs of the same method compress better next to each other.
+    for name, row in sorted(packed.items(), key=lambda one: (one[1].values["method"], one[0])):
         run = read(row.path)
         # Paths are meaningless on other computers.
         run = replace(run, config=run.config | {"results_dir": "results"}, masses={})
@@ -92,7 +93,7 @@ def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
 
 
 def _rounded(run: RunResult, digits: int) -> RunResult:
-    """Round the iterations of a run, and its lowest loss with them."""
+    """Round the iterations of a run, and its lowest loss and wall times with them."""
     # An error of at most half of the last digit of 1.00...: 2^-bits <= 0.5 * 10^(1 - digits).
     bits = min(math.ceil(1.0 + (digits - 1) * math.log2(10.0)), 53)
 
@@ -103,7 +104,8 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
     columns = {
         name: nearest(values) if values.dtype.kind == "f" else values for name, values in run.columns.items()
     }
-    return replace(run, columns=columns, best_loss=float(nearest(run.best_loss)))
+    times = {phase: float(f"{seconds:.{digits}g}") for phase, seconds in run.wall_time.items()}
+    return replace(run, columns=columns, best_loss=float(nearest(run.best_loss)), wall_time=times)
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:

@@ -220,7 +220,7 @@ def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T
             yield error
             return
         # As text, because an absolute name would replace the archive's path. Other programs add folders.
-        places = [Path(f"{path}/{info.filename}") for info in members if not info.is_dir()]
+        places = [Path(f"{path}/{name}") for name in sorted(i.filename for i in members if not i.is_dir())]
     for place in places:
         try:
             with opened(place) as file:
