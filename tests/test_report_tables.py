@@ -264,6 +264,10 @@ def test_agreement_is_within_two_deviations_or_a_tenth(tmp_path: Path) -> None:
     assert data.loc["GD", "difference"] == pytest.approx(0.15) and np.isnan(data.loc["GD", "correlation"])
     ours, papers = [0.88, 0.56, 0.92, 0.19], [0.97, 0.67, 0.92, 0.04]
     assert data.loc["all", "correlation"] == pytest.approx(np.corrcoef(ours, papers)[0, 1])
+    # One run each; the paper's three runs have the unbiased variance 3/2 std^2.
+    noise, spread = 1.5 * np.mean(np.square([0.01, 0.03, 0.02, 0.08])), np.var(papers, ddof=1)
+    expected = (spread - noise / 3) / np.sqrt(spread * (spread - noise / 3 + noise))
+    assert data.loc["all", "expected"] == pytest.approx(expected) and np.isnan(data.loc["GD", "expected"])
 
 
 def test_hyperparameters_are_read_from_the_files() -> None:
@@ -279,13 +283,13 @@ def test_hyperparameters_are_read_from_the_files() -> None:
 
 
 AGREEMENT = {
-    "all gradient": ("150", "0.97", "97 %"),
-    "all RL": ("150", "0.79", "93 %"),
-    "PPO": ("50", "0.95", "92 %"),
-    "TD3": ("50", "0.64", "94 %"),
-    "SAC": ("50", "0.54", "92 %"),
+    "all gradient": ("150", "0.97", "0.96", "97 %"),
+    "all RL": ("150", "0.79", "0.65", "93 %"),
+    "PPO": ("50", "0.95", "0.86", "92 %"),
+    "TD3": ("50", "0.64", "0.42", "94 %"),
+    "SAC": ("50", "0.54", "0.40", "92 %"),
 }
-"""Number of cells, correlation with the paper and agreement of ``release``; also in docs/reproduction.md."""
+"""Cells, correlation with the paper, expected one, agreement of ``release``; also in docs/reproduction.md."""
 
 
 @pytest.mark.parametrize(
@@ -304,8 +308,8 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
     for label, row in AGREEMENT.items() if name == "release" else ():
         (table,) = agreement(gather(resolve(name)))
         cells = table.cells.set_index("method")
-        assert tuple(cells.loc[label, ["cells", "correlation", "agree"]]) == row
-        assert " of ".join(row[:1] * 2) + f" | {row[1]} | {row[2]} |" in page
+        assert tuple(cells.loc[label, ["cells", "correlation", "expected", "agree"]]) == row
+        assert " | ".join((f"{row[0]} of {row[0]}", *row[1:])) in page
 
 
 @pytest.fixture(scope="module")

@@ -269,12 +269,13 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
     """Return the common cells, one row per task, variant and method.
 
     Returns:
-        Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
-        minus the paper's) and agrees (whether it is within two standard deviations or the tolerance).
+        Columns task, variant, method, ours, paper, paper_std (of the population), paper_runs, runs,
+        difference (ours minus the paper's) and agrees (whether it is within two standard deviations or the
+        tolerance).
     """
     cells = compare(runs, "configuration").query("runs > 0 and paper_runs > 0").reset_index(drop=True)
     cells = cells.rename(columns={"mean": "ours", "paper_mean": "paper"})
-    cells = cells[["task", "variant", "method", "ours", "paper", "paper_std", "runs"]]
+    cells = cells[["task", "variant", "method", "ours", "paper", "paper_std", "paper_runs", "runs"]]
     apart = cells["ours"] - cells["paper"]
     allowed = np.maximum(2.0 * cells["paper_std"], TOLERANCE)
     return cells.assign(difference=apart, agrees=apart.abs() <= allowed)
@@ -295,13 +296,15 @@ def agreement(runs: Runs) -> list[Table]:
             "method": data["method"],
             "cells": data["cells"].map(str),
             "correlation": data["correlation"].map(number),
+            "expected": data["expected"].map(number),
             "mean distance": data["distance"].map(number),
             "mean difference": [number(value, sign=True) for value in data["difference"]],
             "agree": [f"{number(100.0 * share, 0)} %" for share in data["agree"]],
         }
     )
     notes = [
-        "Mean scores of common configurations. Correlation: Pearson's. Distance: absolute difference of the "
+        "Mean scores of common configurations. Correlation: Pearson's; expected: if the paper's runs were "
+        "repeated as often as ours, given its standard deviations. Distance: absolute difference of the "
         f"means; difference: ours minus the paper's. Agree: {AGREES}.",
         *settings_note(runs),
     ]
@@ -312,12 +315,19 @@ def overall_agreement(cells: pd.DataFrame) -> dict[str, float]:
     """Return the overall agreement of some of the :func:`compared_cells`.
 
     Returns:
-        Number of ``cells``, ``correlation`` (NaN without variation), mean ``distance``, mean ``difference``,
-        and the fraction ``agree``.
+        Number of ``cells``, ``correlation`` (NaN without variation), the correlation ``expected`` if the
+        paper's runs were repeated as often as ours, mean ``distance``, mean ``difference``, and the fraction
+        ``agree``.
     """
+    # Noise of the means lowers a correlation (Spearman 1904, attenuation).
+    one_run = cells["paper_std"] ** 2 * cells["paper_runs"] / (cells["paper_runs"] - 1)
+    variance = cells["paper"].var()
+    true = variance - (one_run / cells["paper_runs"]).mean()
+    repeated = true + (one_run / cells["runs"]).mean()
     return {
         "cells": len(cells),
         "correlation": cells["ours"].corr(cells["paper"]),
+        "expected": true / np.sqrt(variance * repeated) if true > 0 else float("nan"),
         "distance": cells["difference"].abs().mean(),
         "difference": cells["difference"].mean(),
         "agree": cells["agrees"].mean(),
