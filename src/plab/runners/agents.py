@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -283,20 +283,28 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return torch.baddbmm(bias.unsqueeze(1), x, weight)
 
 
-def mlp(x: Tensor, part: Part, activation: Callable[[Tensor], Tensor], *, linear_last: bool) -> Tensor:
-    """Evaluate a stacked ``nn.Sequential`` of linear layers for x of shape [stack, row, in]. An activation
-    follows each layer, except the last one if ``linear_last``."""
-    tensors = list(part.values())
+def mlp(
+    x: Tensor, tensors: Iterable[Tensor], activation: Callable[[Tensor], Tensor], *, linear_last: bool
+) -> Tensor:
+    """Evaluate a stacked ``nn.Sequential`` of linear layers, given their weights and biases, for x of shape
+    [stack, row, in]. An activation follows each layer, except the last one if ``linear_last``."""
+    tensors = list(tensors)
     for k in range(0, len(tensors), 2):
         x = linear(x, *tensors[k : k + 2])
         x = x if linear_last and k + 2 == len(tensors) else activation(x)
     return x
 
 
-def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
-    """Return the values of two stacked critics, shape [agent, 2, row]."""
-    pairs = torch.cat([observations, actions], dim=2).repeat_interleave(2, dim=0)
-    return mlp(pairs, part, torch.relu, linear_last=True).view(len(observations), 2, -1)
+def critic_values(tensors: Iterable[Tensor], observations: Tensor, actions: Tensor) -> Tensor:
+    """Return the values of stacked critics, given their weights and biases, shape [agent, critic, row]."""
+    weight, bias, *others = tensors
+    agents, critics = len(observations), len(weight) // len(observations)
+    observations, actions = (x.repeat_interleave(critics, dim=0) for x in (observations, actions))
+    # Separate products, because backpropagation to the actions then omits the long observations.
+    by_observation, by_action = weight.split([observations.shape[2], actions.shape[2]], dim=1)
+    first = torch.baddbmm(linear(observations, by_observation, bias), actions, by_action)
+    values = mlp(torch.relu(first), others, torch.relu, linear_last=True)
+    return values.view(agents, critics, -1)
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:

@@ -260,7 +260,7 @@ class PpoAgents(Agents):
     def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean actions, shape [agent, row, action], and values, shape [agent, row]."""
         pairs = observations.repeat_interleave(2, dim=0)
-        latent = mlp(pairs, self.networks["hidden"], torch.tanh, linear_last=False)
+        latent = mlp(pairs, self.parameters("hidden"), torch.tanh, linear_last=False)
         latent = latent.view(self.count, 2, *latent.shape[1:])
         mean, values = (
             linear(latent[:, k], *self.networks[part].values()) for k, part in enumerate(("mean", "value"))

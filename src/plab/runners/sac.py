@@ -10,11 +10,11 @@ from plab.runners.agents import (
     OffPolicyAgents,
     OffPolicyConfig,
     adam,
+    critic_values,
     descend,
     follow,
     linear,
     mlp,
-    twin_values,
 )
 from plab.runners.policy import Spaces
 
@@ -87,7 +87,7 @@ class SacAgents(OffPolicyAgents):
         the integers for :meth:`plab.runners.agents.ReplayBuffer.sample`; the noises of actions and next
         actions are standard normal, shape [agent, row, action]. Return the coefficient and losses, shape
         [4, agent]."""
-        networks = self.networks
+        critics = self.parameters("critics")
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         own_actions, log_prob = self._drawn(observations, noise)
         ent_coef = self.log_ent_coef.detach().exp().unsqueeze(1)
@@ -96,22 +96,22 @@ class SacAgents(OffPolicyAgents):
         descend(self.optimizers["entropy"], entropy_loss)
         with torch.no_grad():
             next_actions, next_log_prob = self._drawn(next_observations, next_noise)
-            values = twin_values(networks["targets"], next_observations, next_actions).min(1).values
+            values = critic_values(self.parameters("targets"), next_observations, next_actions)
             # Episodes end only by truncation, so the value of the next observation always counts.
-            targets = rewards + self.method.gamma * (values - ent_coef * next_log_prob)
-        errors = twin_values(networks["critics"], observations, actions) - targets.unsqueeze(1)
+            targets = rewards + self.method.gamma * (values.min(1).values - ent_coef * next_log_prob)
+        errors = critic_values(critics, observations, actions) - targets.unsqueeze(1)
         critic_loss = 0.5 * errors.square().mean(2).sum(1)
         descend(self.optimizers["critics"], critic_loss)
-        least = twin_values(networks["critics"], observations, own_actions).min(1).values
+        least = critic_values(critics, observations, own_actions).min(1).values
         actor_loss = (ent_coef * log_prob - least).mean(1)
         descend(self.optimizers["actor"], actor_loss)
-        follow(self.parameters("targets"), self.parameters("critics"), self.method.tau)
+        follow(self.parameters("targets"), critics, self.method.tau)
         losses = ent_coef.squeeze(1), entropy_loss, critic_loss, actor_loss
         return torch.stack([loss.detach() for loss in losses])
 
     def _gaussian(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean and log standard deviation of actions before tanh."""
-        latent = mlp(observations, self.networks["actor"], torch.relu, linear_last=False)
+        latent = mlp(observations, self.parameters("actor"), torch.relu, linear_last=False)
         mean, log_std = (linear(latent, *self.networks[part].values()) for part in ("mean", "log_std"))
         return mean, log_std.clamp(*LOG_STD)
 

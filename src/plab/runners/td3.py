@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from plab.config import ranges
 from plab.plugins import torch
-from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, adam, descend, follow, mlp, twin_values
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, adam, critic_values, descend, follow, mlp
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
@@ -81,27 +81,28 @@ class Td3Agents(OffPolicyAgents):
         are the integers of :meth:`plab.runners.agents.ReplayBuffer.sample`; the noise of the target policy is
         standard normal, shape [agent, row, action]. Return the losses of critics and, if due, actor, shape
         [1 or 2, agent]."""
-        networks, parameters, reach = self.networks, self.parameters, self.method.target_noise_clip
+        parameters, reach = self.parameters, self.method.target_noise_clip
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         with torch.no_grad():
             smoothing = (noise * self.method.target_noise).clamp(-reach, reach)
             next_actions = self._actor("actor_target", next_observations) + smoothing
-            values = twin_values(networks["targets"], next_observations, next_actions.clamp(-1.0, 1.0))
+            values = critic_values(parameters("targets"), next_observations, next_actions.clamp(-1.0, 1.0))
             # An episode ends by truncation only: the value of the next observation always counts.
             targets = rewards + self.method.gamma * values.min(1).values
-        errors = twin_values(networks["critics"], observations, actions) - targets.unsqueeze(1)
+        errors = critic_values(parameters("critics"), observations, actions) - targets.unsqueeze(1)
         losses = [errors.square().mean(2).sum(1)]
         descend(self.optimizers["critics"], losses[0])
         if due:
             own_actions = self._actor("actor", observations)
-            losses.append(-twin_values(networks["critics"], observations, own_actions)[:, 0].mean(1))
+            first = [tensor[::2] for tensor in parameters("critics")]
+            losses.append(-critic_values(first, observations, own_actions).mean((1, 2)))
             descend(self.optimizers["actor"], losses[1])
             for target, source in (("targets", "critics"), ("actor_target", "actor")):
                 follow(parameters(target), parameters(source), self.method.tau)
         return torch.stack([loss.detach() for loss in losses])
 
     def _actor(self, part: str, observations: Tensor) -> Tensor:
-        return torch.tanh(mlp(observations, self.networks[part], torch.relu, linear_last=True))
+        return torch.tanh(mlp(observations, self.parameters(part), torch.relu, linear_last=True))
 
     def _noisy(self, actions: Tensor, noise: Tensor) -> Tensor:
         return (actions + noise * self.method.exploration_noise).clamp(-1.0, 1.0)
