@@ -88,9 +88,9 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         population.prepare(training)
         evaluation = partial(evaluate, judge, population.decide)
         evaluation()
-        population.train(2 * method.num_envs)
+        _train(population, 2 * method.num_envs)
         more = batches * method.num_envs
-        trained = _seconds(lambda: population.train(population.episodes + more))
+        trained = _seconds(lambda: _train(population, more))
         evaluated, stated = _seconds(evaluation), _seconds(population.states)
         parts: dict[str, float] = defaultdict(float)
         simulator = training.problem.simulator
@@ -98,7 +98,7 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         learning = ("act", "policy"), ("learn", "update")
         timed += [(stack, name, part) for stack in population.stacks for name, part in learning]
         with _timing(timed, parts):
-            total = _seconds(lambda: population.train(population.episodes + more))
+            total = _seconds(lambda: _train(population, more))
         parts["rest"] = total - sum(parts.values())
     share = more / method.evaluate_every
     if torch.cuda.is_initialized():
@@ -118,6 +118,13 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         "state_s": round(stated, 3),
         "agent_mb": round(held / agents / 1e6, 1),
     } | {f"{part}_ms": round(parts[part] / (batches * horizon) * 1e3, 2) for part in PARTS}
+
+
+def _train(population: RlRunner, episodes: int) -> None:
+    """Train each agent for some more episodes."""
+    until = population.episodes + episodes
+    while population.episodes < until:
+        population.cycle()
 
 
 def _seconds(call: Callable[[], object]) -> float:
