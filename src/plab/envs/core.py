@@ -571,18 +571,18 @@ class EpisodeBatch:
                 simulator.
         """
         self.require_running(steps=steps, frozen=True)
-        taken, observer = self._steps, self._sensors.observer
+        taken, sensors = self._steps, self._sensors
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
-            seen = observer(particles, poses)
+            seen = sensors.state(particles, poses)
             return choose(t, self._noisy(seen, taken + t))
 
         def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
             bar = react(t, actions_bar)
-            return None if bar is None else observer.pull_back(bar)
+            return None if bar is None else sensors.pull_back(bar)
 
         terms = self._simulator.closed_loop(
-            steps, chosen, reaction, stride=observer.stride, discount=discount, like=like
+            steps, chosen, reaction, stride=sensors.stride, discount=discount, like=like
         )
         self._steps = taken + steps
         self._update(self._observe(like), self._measured(like), kept=list(self.failures))

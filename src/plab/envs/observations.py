@@ -32,48 +32,6 @@ Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor if the caller passed one."""
 
 
-class Observer:
-    """Observations of the environments of a batch.
-
-    Attributes:
-        stride: Stride between observed particles.
-        constant: Number of trailing entries of an observation that are constant within an episode.
-    """
-
-    def __init__(self, problem: Problem, cfg: Config, known: Callable[[], Mapping[int, np.ndarray]]) -> None:
-        """Select the entries for a configuration, and compute the constant ones, except those that ``known``
-        returns by environment."""
-        scene = problem.scenes[0]
-        self.stride = _stride(scene, cfg.observe_particles)
-        self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
-        self._numbers = len(scene.manipulators) * 8
-        self.constant, slices = target_entries(cfg.observe_target), cfg.observe_target
-        nothing = np.empty((len(problem.scenes), 0))
-        self._target = Constants(_target_observations(problem, known(), slices) if slices else nothing)
-
-    def __call__(self, particles: Array, poses: Array) -> Array:
-        """Return observations, shape [batch, entry], given particles, shape [batch, observed, 6], and all
-        poses, shape [batch, manipulator, 8]."""
-        size = len(particles)
-        rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
-        rows.append(self._target.like(rows[0]))
-        if on_device(rows[0]):
-            # A tensor implies that torch has been imported.
-            import torch
-
-            return torch.cat(rows, dim=1)
-        return np.concatenate(rows, axis=1)
-
-    def pull_back(self, bar: Array) -> tuple[Array, Array]:
-        """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
-        [batch, manipulator, 8], given those with respect to observations, shape [batch, entry]."""
-        size, particles = len(bar), 6 * self._count
-        whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
-        # The entries after the poses are constant.
-        whole[:, self._poses] = bar[:, particles : particles + len(self._poses)]
-        return bar[:, :particles].reshape(size, self._count, 6), whole.reshape(size, -1, 8)
-
-
 class SurfacePoints:
     """Particles at the surface of bodies.
 
@@ -138,11 +96,9 @@ class Sensors:
 
     Attributes:
         names: Names of the observations, from :data:`OBSERVATIONS`.
-        observer: Observer of ``state``; set by :meth:`refresh`.
+        stride: Stride between the particles of ``state``.
         space: Space of one environment's observation: a Box for a single observation, or a Dict.
     """
-
-    observer: Observer
 
     def __init__(
         self,
@@ -177,11 +133,14 @@ class Sensors:
         looking = self._pictures or "points" in self.names
         self._cameras = {name: CameraSensor(simulator, one) for name, one in self.cameras.items() if looking}
         sensors = list(self._cameras.values())
-        force = Box(-np.inf, np.inf, (simulator.manipulator_count, 3), np.float32)
-        self._cfg, points = cfg, min(cfg.observe_particles, simulator.particle_count)
+        scene, self._manipulators = simulator.scenes[0], simulator.manipulator_count
+        self.stride, self._poses = _stride(scene, cfg.observe_particles), _pose_entries(scene)
+        self._slices, self._constant = cfg.observe_target, target_entries(cfg.observe_target)
+        points = min(cfg.observe_particles, simulator.particle_count)
+        force = Box(-np.inf, np.inf, (self._manipulators, 3), np.float32)
 
         def state(like: Array) -> Array:
-            return self.observer(simulator.observe(self.observer.stride, like), simulator.poses(like))
+            return self.state(simulator.observe(self.stride, like), simulator.poses(like))
 
         def positions(like: Array) -> Array:
             return simulator.observe(1, like)[..., :3]
@@ -191,12 +150,15 @@ class Sensors:
             "particles": (_unit(simulator.particle_count, 3), positions),
             "mass": (_unit(CELLS, CELLS, CELLS), lambda like: _shares(positions(like))),
             "impulses": (force, simulator.impulses),
-            "target_mass": (_unit(CELLS, CELLS, CELLS), _OfTargets(simulator, coarse_shares)),
-            "target_points": (_unit(points, 3), _OfTargets(simulator, lambda mass: _sampled(mass, points))),
+            "target_mass": (_unit(CELLS, CELLS, CELLS), lambda like: self._goals["target_mass"].like(like)),
+            "target_points": (_unit(points, 3), lambda like: self._goals["target_points"].like(like)),
             "points": (_unit(points, 4 if sensors else 3), SurfacePoints(simulator, points, sensors)),
         }
         spaces = {name: space for name, (space, _) in sources.items() if name in self.names}
         self._sources = {name: sources[name][1] for name in spaces}
+        of_target = {"target_mass": coarse_shares, "target_points": lambda mass: _sampled(mass, points)}
+        self._of_target = {name: one for name, one in of_target.items() if name in self.names}
+        self._masses: np.ndarray | None = None
         for name, camera in self.cameras.items():
             width, height = camera.size
             known: dict[str, Space[Any]] = {
@@ -210,11 +172,17 @@ class Sensors:
 
     def release(self) -> None:
         """Release the simulator and its memory."""
-        self._sources, self._cameras = {}, {}
+        self._sources, self._cameras, self._masses = {}, {}, None
 
     def refresh(self, problem: Problem, known: Callable[[], Mapping[int, np.ndarray]]) -> None:
-        """Update after a change of scenes and targets; arguments are those of :class:`Observer`."""
-        self.observer = Observer(problem, self._cfg, known)
+        """Update after a change of scenes and targets. The constant entries of ``state`` are computed, except
+        those that ``known`` returns by environment."""
+        masses, nothing = problem.target_mass, np.empty((len(problem.scenes), 0))
+        entries = _target_observations(problem, known(), self._slices) if self._slices else nothing
+        self._target = Constants(entries)
+        if masses is not self._masses:
+            self._masses, of_target = masses, self._of_target.items()
+            self._goals = {name: Constants([observe(mass) for mass in masses]) for name, observe in of_target}
         for sensor in self._cameras.values():
             sensor.refresh()
 
@@ -229,6 +197,30 @@ class Sensors:
                 out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
         return next(iter(out.values())) if self._alone else out
 
+    def state(self, particles: Array, poses: Array) -> Array:
+        """Return ``state``, shape [batch, entry], given particles, shape [batch, observed, 6], and all poses,
+        shape [batch, manipulator, 8]."""
+        size = len(particles)
+        rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
+        rows.append(self._target.like(rows[0]))
+        if on_device(rows[0]):
+            # A tensor implies that torch has been imported.
+            import torch
+
+            return torch.cat(rows, dim=1)
+        return np.concatenate(rows, axis=1)
+
+    def pull_back(self, bar: Array) -> tuple[Array, Array]:
+        """Return the derivatives with respect to particles, shape [batch, observed, 6], and poses, shape
+        [batch, manipulator, 8], given those with respect to ``state``, shape [batch, entry]."""
+        shape = len(bar), 8 * self._manipulators
+        whole = bar.new_zeros(shape) if on_device(bar) else np.zeros(shape)
+        # The entries after the poses are constant.
+        end = bar.shape[1] - self._constant
+        first = end - len(self._poses)
+        whole[:, self._poses] = bar[:, first:end]
+        return bar[:, :first].reshape(len(bar), -1, 6), whole.reshape(len(bar), -1, 8)
+
     def noisy(self, observation: Any, deviations: np.ndarray, rngs: Sequence[np.random.Generator]) -> Any:
         """Return observations of a batch with Gaussian noise, clipped to their space. Colours, labels and
         constant entries of ``state`` have no noise.
@@ -241,8 +233,8 @@ class Sensors:
                 return values
             noise = np.stack([rng.standard_normal(space.shape, np.float32) for rng in rngs])
             noise *= deviations.astype(np.float32).reshape(-1, *[1] * len(space.shape))
-            if name == "state" and (constant := self.observer.constant):
-                noise[:, -constant:] = 0.0
+            if name == "state" and self._constant:
+                noise[:, -self._constant :] = 0.0
             if name == "points":
                 noise[..., 3:] = 0.0
             low, high = space.low, space.high
@@ -258,20 +250,6 @@ class Sensors:
             return one(self.names[0], observation, cast(Box, self.space))
         spaces = cast(Dict, self.space).spaces
         return {name: one(name, values, cast(Box, spaces[name])) for name, values in observation.items()}
-
-
-class _OfTargets:
-    """Observation of the targets' mass tensors, updated when they change."""
-
-    def __init__(self, simulator: Simulator, observe: Callable[[np.ndarray], np.ndarray]) -> None:
-        self._simulator, self._observe = simulator, observe
-        self._known: np.ndarray | None = None
-
-    def __call__(self, like: Array) -> Array:
-        masses = self._simulator.target_mass
-        if masses is not self._known:
-            self._known, self._values = masses, Constants([self._observe(mass) for mass in masses])
-        return self._values.like(like)
 
 
 def _unit(*shape: int) -> Box:
