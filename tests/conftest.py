@@ -110,8 +110,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 def replayed(monkeypatch: pytest.MonkeyPatch, recording: object) -> list[tuple]:
     """Use the module's recording instead of simulations; return what was to be simulated."""
     asked: list[tuple] = []
-    for name in ("record", "record_with_motion"):
-        monkeypatch.setattr(f"plab.render.rollouts.{name}", lambda *given: asked.append(given) or recording)
+    monkeypatch.setattr("plab.render.rollouts.record", lambda *given, **_: asked.append(given) or recording)
     return asked
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from plab.cli.rollouts import export as main
 from plab.config import load_config
-from plab.render.rollouts import RecordedRollout, record_with_motion
+from plab.render.rollouts import RecordedRollout, record
 from toy_runner import COARSE
 
 pv = pytest.importorskip("pyvista")
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("in_an_empty_folder")
 
 @pytest.fixture(scope="module")
 def recording() -> RecordedRollout:
-    return record_with_motion(load_config(["task=Assembly", *COARSE]), np.full((3, 6), 0.5))
+    return record(load_config(["task=Assembly", *COARSE]), np.full((3, 6), 0.5), motion=True)
 
 
 def test_a_vtk_series_is_read_back(recording):
@@ -61,7 +61,7 @@ def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
 
 
 def test_the_command_line_writes_a_folder_named_like_the_task(told, capsys, monkeypatch, recording):
-    monkeypatch.setattr("plab.render.rollouts.record_with_motion", lambda cfg, actions: recording)
+    monkeypatch.setattr("plab.render.rollouts.record", lambda cfg, actions, motion: recording)
     words = ["task=Assembly", *COARSE]
     assert main([*words, "--every", "3"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "Assembly-v1-vtk"

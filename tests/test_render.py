@@ -23,7 +23,7 @@ from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
-from plab.render.rollouts import next_problem, record, record_with_motion
+from plab.render.rollouts import next_problem, record
 from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.sim.cameras import CameraSensor
@@ -193,7 +193,7 @@ def test_the_target_is_a_ghost_that_vanishes_where_it_is_reached_or_drawn_alone(
 
 @pytest.fixture(scope="module")
 def recording():
-    return record_with_motion(load_config(["task=Rope", *COARSE]), np.full((3, 6), 0.5))
+    return record(load_config(["task=Rope", *COARSE]), np.full((3, 6), 0.5), motion=True)
 
 
 def test_a_recording_holds_the_start_and_every_step(recording):

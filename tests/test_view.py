@@ -48,7 +48,7 @@ def recording() -> RecordedRollout:
     poses = np.array([[*m.position, *m.rotation, m.gap] for m in scene.manipulators])
     mass = spread_mass(x + np.array([0.0, 0.3, 0.0]), 16, scene.particle_mass)
     scores = np.array([0.0, 0.1, 0.2, 0.3])
-    return RecordedRollout("Rope", "1", scene, mass, x + WAY[..., :3], poses + WAY, scores)
+    return RecordedRollout("1", scene, mass, x + WAY[..., :3], poses + WAY, scores)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,8 @@ def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
     assert viewer.page(recording) == page
     assert not re.search(r"""(src|href)\s*=\s*["']""", page)
     assert "Permission is hereby granted" in page and "Three.js Authors" in page
-    strange = viewer.page(dataclasses.replace(recording, task="</title><b>"))
+    scene = dataclasses.replace(recording.scene, name="</title><b>")
+    strange = viewer.page(dataclasses.replace(recording, scene=scene))
     assert "</title><b>" not in strange and "&lt;/title&gt;&lt;b&gt;, variant 1" in strange
 
 

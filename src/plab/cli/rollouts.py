@@ -5,9 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from plab.cli.command import (
     Parser,
@@ -23,9 +20,6 @@ from plab.config.compose import check_overrides, check_sources
 from plab.config.suite import EXTENSION_TASKS
 from plab.errors import ArgumentError
 from plab.render.graphics import RenderError, require_graphics, require_packages
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 _MAX_FRAME_SIZE = 4096
 """Largest frame width and height [pixels], supported by all OpenGL versions and by H.264."""
@@ -59,10 +53,10 @@ def render(argv: Sequence[str]) -> None:
     require_graphics()
     # Imported here and below, because it loads the simulator, which the checks above do not need.
     from plab.render import pictures
-    from plab.render.rollouts import record
+    from plab.render.rollouts import record, rollout
 
     pictures.check_output(path)
-    pictures.save(record(*rollout(options)), path, options.size, options.every or 1)
+    pictures.save(record(*rollout(options.source)), path, options.size, options.every or 1)
     print(path)
 
 
@@ -100,7 +94,7 @@ def view(argv: Sequence[str]) -> None:
         raise RenderError(f"cannot write {output}: its suffix must be .html")
     to_write(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
-    from plab.render.rollouts import demonstration, record_with_motion
+    from plab.render.rollouts import record, rollout
     from plab.report.page import render as html
     from plab.results.run_file import replace_file
     from plab.view.page import page
@@ -109,12 +103,12 @@ def view(argv: Sequence[str]) -> None:
         pages = []
         for task in (one for one in choices("task", options.config_dir) if one not in EXTENSION_TASKS):
             cfg = load_config([f"task={task}", *options.what], options.config_dir)
-            recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
+            recording, file = record(*rollout(cfg), motion=True), f"{task}-v{cfg.variant}.html"
             replace_file(output.with_name(file), page(recording, options.every, surface=options.surface))
             pages.append((task, file, recording.score))
         replace_file(output, html("gallery.html", "plab.view", pages=pages))
     else:
-        recording = record_with_motion(*rollout(options))
+        recording = record(*rollout(options.source), motion=True)
         replace_file(output, page(recording, options.every, surface=options.surface))
     print(output)
 
@@ -148,9 +142,9 @@ def export(argv: Sequence[str]) -> None:
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
     from plab.export.writers import write_ply, write_vtk
     from plab.files import complete_folder
-    from plab.render.rollouts import record_with_motion
+    from plab.render.rollouts import record, rollout
 
-    recording = record_with_motion(*rollout(options))
+    recording = record(*rollout(options.source), motion=True)
     with complete_folder(output) as fresh:
         (write_vtk if options.format == "vtk" else write_ply)(recording, fresh, options.every or 1)
     print(output)
@@ -206,15 +200,6 @@ def resolve_rollout(options: argparse.Namespace, ending: str) -> Path:
         raise RenderError("nothing to show: name a result file, or a task such as task=Torus; see --help")
     options.output = options.output or usual
     return options.output
-
-
-def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
-    """Return configuration and actions, shape [T, A], of the rollout found by :func:`resolve_rollout`."""
-    from plab.render import rollouts
-
-    if isinstance(options.source, Path):
-        return rollouts.result(options.source)
-    return options.source, rollouts.demonstration(options.source)
 
 
 def _size(text: str) -> tuple[int, int]:

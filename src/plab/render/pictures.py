@@ -82,7 +82,10 @@ def _renderer(recording: RecordedRollout, size: tuple[int, int]) -> closing[Rend
 def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path: Path) -> None:
     first, last, steps = recording.poses[0], recording.poses[-1], len(recording.x) - 1
     panels = [
-        (renderer.frame(recording.x[0], first), f"{recording.task}, variant {recording.variant}: start"),
+        (
+            renderer.frame(recording.x[0], first),
+            f"{recording.scene.name}, variant {recording.variant}: start",
+        ),
         (renderer.target(first), "target"),
         (renderer.frame(recording.x[-1], last), f"after {steps} steps: score {recording.score:.2f}"),
     ]

@@ -19,7 +19,6 @@ from plab.problem import Problem, build_scenes, make_simulator, require_alike
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scenes import Scene, SceneError
-from plab.sim import Simulator
 from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
 
@@ -29,9 +28,8 @@ class RecordedRollout:
     """A rollout in the hard contact model.
 
     Attributes:
-        task: Name of the task.
         variant: Name of the variant.
-        scene: The scene.
+        scene: The scene, which has the name of the task.
         target_mass: Mass tensor of the target, shape [n, n, n]; None if it is not available.
         x: Particle positions [domain units] initially and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
@@ -41,7 +39,6 @@ class RecordedRollout:
         F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
 
-    task: str
     variant: str
     scene: Scene
     target_mass: np.ndarray | None
@@ -118,45 +115,34 @@ def demonstration(cfg: Config) -> np.ndarray:
     return actions
 
 
-def record(cfg: Config, actions: np.ndarray, problem: Problem | None = None) -> RecordedRollout:
-    """Simulate actions in [-1, 1], shape [T, A], from the initial state of a configuration, or in its problem
-    if that has been built."""
-    problem = problem or Problem([cfg])
-    return _recording(cfg, problem.simulator, problem, actions)
+def rollout(source: Path | Config) -> tuple[Config, np.ndarray]:
+    """Return configuration and actions, shape [T, A]: those of a result file, see :func:`result`, or the best
+    known ones, see :func:`demonstration`."""
+    return result(source) if isinstance(source, Path) else (source, demonstration(source))
 
 
-def next_problem(cfg: Config, before: tuple[Config, Problem] | None) -> Problem:
-    """Return a configuration's problem, with the simulator of the one before if both scenes are of the same
-    kind, which saves compiling."""
-    if before is not None:
-        simulator = before[1].simulator
-        with suppress(ConfigError, SceneError):
-            require_alike([before[0], cfg])
-            simulator.set_scenes(build_scenes([cfg]))
-            return Problem([cfg], simulator)
-    return Problem([cfg])
-
-
-def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
-    """Simulate and record as :func:`record` does, with velocities and deformation gradients.
-
-    If the target cannot be generated, for example because its file is missing, it is omitted with a message.
-    """
-    try:
-        problem = Problem([cfg])
-    except TargetError as error:
-        print_once(f"without target and scores: {error}")
-        return _recording(cfg, make_simulator([cfg]), None, actions, motion=True)
-    if cfg.targets.source is not None:
-        print_once(f"the output contains your target file from {cfg.targets.source}: check its licence")
-    return _recording(cfg, problem.simulator, problem, actions, motion=True)
-
-
-def _recording(
-    cfg: Config, simulator: Simulator, problem: Problem | None, actions: np.ndarray, *, motion: bool = False
+def record(
+    cfg: Config, actions: np.ndarray, problem: Problem | None = None, *, motion: bool = False
 ) -> RecordedRollout:
-    """Simulate actions, shape [T, A], and record target and scores if a problem is given."""
+    """Simulate actions from the initial state of a configuration.
+
+    Args:
+        cfg: The configuration.
+        actions: Actions in [-1, 1], shape [T, A].
+        problem: The problem of the configuration, if it has been built.
+        motion: Whether to record velocities, deformation gradients and all scores, too. If the target cannot
+            be generated then, for example because its file is missing, it is omitted with a message.
+    """
     states, scores, actions = [], [], np.asarray(actions)
+    try:
+        problem = problem or Problem([cfg])
+    except TargetError as error:
+        if not motion:
+            raise
+        print_once(f"without target and scores: {error}")
+    if motion and problem is not None and cfg.targets.source is not None:
+        print_once(f"the output contains your target file from {cfg.targets.source}: check its licence")
+    simulator = make_simulator([cfg]) if problem is None else problem.simulator
     if actions.shape != (len(actions), simulator.action_dim):
         raise RenderError(f"actions must have the shape [T, {simulator.action_dim}], not {actions.shape}")
     simulator.set_contact("hard")
@@ -169,13 +155,24 @@ def _recording(
             scores.append(problem.scores(simulator.mass_tensor())[0].score)
     names = ("x", "poses", *(("v", "F") if motion else ()))
     return RecordedRollout(
-        task=cfg.task.name,
         variant=cfg.variant,
         scene=simulator.scenes[0],
         target_mass=None if problem is None else problem.target_mass[0],
         scores=None if problem is None else np.array(scores),
         **{name: np.stack([getattr(state, name)[0] for state in states]) for name in names},
     )
+
+
+def next_problem(cfg: Config, before: tuple[Config, Problem] | None) -> Problem:
+    """Return a configuration's problem, with the simulator of the one before if both scenes are of the same
+    kind, which saves compiling."""
+    if before is not None:
+        simulator = before[1].simulator
+        with suppress(ConfigError, SceneError):
+            require_alike([before[0], cfg])
+            simulator.set_scenes(build_scenes([cfg]))
+            return Problem([cfg], simulator)
+    return Problem([cfg])
 
 
 print_once = functools.cache(print_error)

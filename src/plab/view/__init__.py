@@ -89,5 +89,5 @@ def show(
     if runtime := in_use():
         sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
         cfg = dataclasses.replace(cfg, sim=sim)
-    shown = rollouts.record_with_motion(cfg, actions)
+    shown = rollouts.record(cfg, actions, motion=True)
     return Viewer(page(shown, every, surface=surface), shown.score, height)

@@ -82,7 +82,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         "aspect": _ASPECT,
         "interpolate": not surface,
     }
-    title = f"{recording.task}, variant {recording.variant}"
+    title = f"{recording.scene.name}, variant {recording.variant}"
     bar = render(
         "bar.html",
         "plab.view",
