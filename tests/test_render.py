@@ -20,10 +20,10 @@ from plab.cli.rollouts import render as main
 from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.objective import spread_mass
-from plab.problem import Problem
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
-from plab.render.rollouts import next_problem, record
+from plab.render.rollouts import record
+from plab.runners.runner import SimulatorCache, shared_problem
 from plab.scenes import Body, Camera, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
 from plab.sim.cameras import CameraSensor
@@ -230,12 +230,11 @@ def test_runs_of_a_task_share_a_simulator():
         run = results.RunResult(results.config_dict(cfg), cfg.hash, best_actions=np.full((3, 6), 0.5))
         results.write(run, Path(cfg.variant, "run.h5"))
         wanted[Path(f"Rope-v{cfg.variant}")] = Path(cfg.variant, "run.h5"), False
-    draw_runs(wanted, lambda: None)
+    cache, made = SimulatorCache(), []
+    draw_runs(wanted, lambda: None, lambda cfg: made.append(shared_problem(cache, [cfg])) or made[-1])
     assert len(list(Path.cwd().glob("Rope-v[12]/*.webp"))) == 6
-    first = Problem(cfgs[:1])
-    problem = next_problem(cfg, (cfgs[0], first))
-    assert problem.simulator is first.simulator
-    np.testing.assert_array_equal(record(cfg, run.best_actions, problem).x, record(cfg, run.best_actions).x)
+    assert made[0].simulator is made[1].simulator
+    np.testing.assert_array_equal(record(cfg, run.best_actions, made[1]).x, record(cfg, run.best_actions).x)
 
 
 # ----------------------------------------------------------------------------------------------- command line

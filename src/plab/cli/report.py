@@ -88,8 +88,10 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
             require_graphics()
             # Imported here, because everything else works without PyVista and Taichi.
             from plab.render.pictures import draw_runs
+            from plab.runners.runner import SimulatorCache, shared_problem
 
-            draw_runs(wanted, page.write)
+            cache = SimulatorCache()
+            draw_runs(wanted, page.write, lambda cfg: shared_problem(cache, [cfg]))
         except RenderError as error:
             print_error(f"without pictures: {error}")
         finally:

@@ -20,7 +20,7 @@ from plab.progress import show_progress
 from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
-from plab.render.rollouts import RecordedRollout, next_problem, record, result
+from plab.render.rollouts import RecordedRollout, record, result
 from plab.results.run_file import replace_file
 
 STEPS_PER_SECOND = 20
@@ -147,13 +147,16 @@ def tiled(tiles: Sequence[tuple[np.ndarray, str]], columns: int) -> Image.Image:
 # ------------------------------------------------------------------------------------------------------ runs
 
 
-def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None]) -> None:
+def draw_runs(
+    wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None], build: Callable[[Config], Problem]
+) -> None:
     """Render runs, see :func:`save_set`, in the order of their folders.
 
     Args:
         wanted: Result file, and whether to make a film, by folder. Folders must not exist, and appear when
             they are complete.
         drawn: Callback after each completed folder.
+        build: Function that returns the problem of a configuration.
 
     Raises:
         RenderError: If rendering is not possible, a file cannot be written, or runs cannot be replayed; all
@@ -161,7 +164,6 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
     """
     require_graphics()
     troubles: list[str] = []
-    before: tuple[Config, Problem] | None = None
     for place in {folder.parent for folder in wanted}:
         # Leftover pictures of killed processes.
         for folder in place.glob(f"{UNFINISHED}*"):
@@ -170,8 +172,7 @@ def draw_runs(wanted: Mapping[Path, tuple[Path, bool]], drawn: Callable[[], None
         for number, (folder, (path, film)) in enumerate(sorted(wanted.items()), start=1):
             try:
                 cfg, actions = result(path)
-                before = cfg, next_problem(cfg, before)
-                recording = record(cfg, actions, before[1])
+                recording = record(cfg, actions, build(cfg))
             except PlabError as error:
                 troubles.append(f"{folder.name} cannot be replayed: {error}")
                 continue

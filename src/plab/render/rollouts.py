@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.errors import ConfigError, print_error
-from plab.problem import Problem, build_scenes, make_simulator, require_alike
+from plab.errors import print_error
+from plab.problem import Problem, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
-from plab.scenes import Scene, SceneError
+from plab.scenes import Scene
 from plab.sim.runtime import cuda_devices
 from plab.targets import TargetError
 
@@ -161,18 +160,6 @@ def record(
         scores=None if problem is None else np.array(scores),
         **{name: np.stack([getattr(state, name)[0] for state in states]) for name in names},
     )
-
-
-def next_problem(cfg: Config, before: tuple[Config, Problem] | None) -> Problem:
-    """Return a configuration's problem, with the simulator of the one before if both scenes are of the same
-    kind, which saves compiling."""
-    if before is not None:
-        simulator = before[1].simulator
-        with suppress(ConfigError, SceneError):
-            require_alike([before[0], cfg])
-            simulator.set_scenes(build_scenes([cfg]))
-            return Problem([cfg], simulator)
-    return Problem([cfg])
 
 
 print_once = functools.cache(print_error)
