@@ -9,8 +9,6 @@ from typing import Any
 
 from plab.laws.tracing import Trace, derivatives, evaluated
 
-__all__ = ["Law", "Parameter"]
-
 
 @dataclass(frozen=True)
 class Parameter:

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-__all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen", "require_supported"]
-
 Number = Any
 """A node or a constant."""
 

@@ -11,8 +11,6 @@ from plab.losses.term import ParticleTerm
 from plab.objective import mass_portions
 from plab.sim.compiler import ti
 
-__all__ = ["Chamfer"]
-
 POINTS = 500
 """Points of a target."""
 

@@ -11,8 +11,6 @@ Distances are 0 inside a manipulator. Each term is summed over the moving manipu
 from plab.losses.term import DistanceTerm
 from plab.sim.compiler import ti
 
-__all__ = ["AllContact", "NearestContact", "SoftContact"]
-
 FAR = 1e9
 """Initial value for the distance of the nearest particle [domain units]."""
 

@@ -5,8 +5,6 @@ import numpy as np
 from plab.losses.term import NodeTerm
 from plab.sim.compiler import ti
 
-__all__ = ["Density"]
-
 
 class Density(NodeTerm):
     """Sum over the grid of the absolute difference between mass S and target mass S*, as in the paper."""

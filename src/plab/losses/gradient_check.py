@@ -12,8 +12,6 @@ from plab.losses.term import Term
 from plab.scenes import Scene
 from plab.sim import Simulator, State
 
-__all__ = ["check_gradient"]
-
 STEP = 1e-6
 """Half the step of a central difference, along directions of unit variance."""
 

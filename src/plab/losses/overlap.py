@@ -8,8 +8,6 @@ from plab.losses.term import NodeTerm
 from plab.sim.compiler import ti
 from plab.sim.tensors import Constants
 
-__all__ = ["Overlap"]
-
 
 class Overlap(NodeTerm):
     """Sum over the grid of mass times target mass, from which the soft IoU is computed."""

@@ -3,8 +3,6 @@
 from plab.losses.term import NodeTerm
 from plab.sim.compiler import ti
 
-__all__ = ["Sdf"]
-
 
 class Sdf(NodeTerm):
     """Sum over the grid of mass times distance to the target, as in the paper."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from plab.config import Config
 
-__all__ = ["Viewer", "show"]
-
 _HEIGHT = 480
 
 
