@@ -59,6 +59,9 @@ SEED = _in_range("at least 0 and below 2^32", lambda value: 0 <= value < 2**32)
 UNIT = _in_range("in [0, 1]", lambda value: 0 <= value <= 1)
 DECAYS = _in_range("two numbers in [0, 1)", lambda value: len(value) == sum(0 <= v < 1 for v in value) == 2)
 RATES = _in_range("positive numbers", lambda value: value and all(0 < v < math.inf for v in value))
+ROTATION = _in_range(
+    "a unit quaternion", lambda value: len(value) == 4 and abs(math.hypot(*value) - 1.0) < 1e-3
+)
 WIDTHS = _in_range("numbers of at least 1", lambda value: all(width >= 1 for width in value))
 THREADS = COUNT
 """Metadata of fields; FINITE includes a lower bound of 0; THREADS and WIDTHS are for torch and its layers."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +84,7 @@ class ManipulatorConfig(ranges.Section):
     shape: str
     size: list[float]
     position: list[float] = field(metadata=ranges.POINT)
-    rotation: list[float] = field(metadata=ranges.within(ranges.vector, 4))
+    rotation: list[float] = field(metadata=ranges.ROTATION)
     scale: list[float]
     friction: float
     lower_bound: list[float] = field(metadata=ranges.POINT)
@@ -142,7 +141,7 @@ class KinematicsConfig(ranges.Section):
     size: float = field(default=1.0, metadata=ranges.POSITIVE)
     position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.5], metadata=ranges.POINT)
     rotation: list[float] = field(
-        default_factory=lambda: [0.5**0.5, -(0.5**0.5), 0.0, 0.0], metadata=ranges.within(ranges.vector, 4)
+        default_factory=lambda: [0.5**0.5, -(0.5**0.5), 0.0, 0.0], metadata=ranges.ROTATION
     )
     free: bool = False
     start: dict[str, float] = field(default_factory=dict)
@@ -151,12 +150,6 @@ class KinematicsConfig(ranges.Section):
     omit: list[str] = field(default_factory=list)
     friction: float = field(default=5.0, metadata=ranges.NOT_NEGATIVE)
     sha256: str | None = None
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        if not math.isclose(math.hypot(*self.rotation), 1.0, abs_tol=1e-3):
-            raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
 
     def build(self) -> Chain:
         """Return the scene's articulated model, replace the model's name by its path, unless it is in a
