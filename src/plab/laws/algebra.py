@@ -127,23 +127,17 @@ class Series:
     j_max: float = 1.6
 
     def unimodular_scale(self, j):
-        """J^(-2/3), which makes det(J^(-2/3) G G^T) = 1."""
-        c = inverse_cbrt(j, self.cbrt_steps)
+        """J^(-2/3) for J near 1, which makes det(J^(-2/3) G G^T) = 1."""
+        e = j - 1.0
+        c = 1.0 - e * (1.0 / 3.0) + e * e * (2.0 / 9.0)
+        for _ in range(self.cbrt_steps):
+            c = c * (4.0 - j * (c * c * c)) * (1.0 / 3.0)
         return c * c
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
         """Terms for ``float32`` or ``float64``: truncation errors below rounding within the range."""
         return cls(4, 6, 3) if precision == "float32" else cls(9, 11, 4)
-
-
-def inverse_cbrt(j, steps):
-    """J^(-1/3) for J near 1: Newton steps from the second-order expansion at 1."""
-    e = j - 1.0
-    c = 1.0 - e * (1.0 / 3.0) + e * e * (2.0 / 9.0)
-    for _ in range(steps):
-        c = c * (4.0 - j * (c * c * c)) * (1.0 / 3.0)
-    return c
 
 
 def log_coefficients(i1, i2, i3, terms):
