@@ -61,14 +61,12 @@ class Family:
         config: Type of the ``method`` section, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
-        columns: Additional columns of the results.
-        may_be_nan: Columns that may contain NaN.
-        ranking: Criterion for the best actions of a run: lowest ``loss``, or highest ``score``, with ties
-            broken by loss.
+        columns: Additional columns of the results, which may contain NaN.
+        ranking: Criterion for the best actions of a run: lowest ``loss``, or highest ``score`` in the hard
+            contact model, with ties broken by loss.
         batching: Whether runs can share a simulator; otherwise they are executed one by one.
         in_step: Whether runs of a batch must have the same ``method`` section, as agents in lockstep do.
         rules: Choices of ``method.algorithm`` or ``method.optimizer``, if any.
-        contact: Contact model of the rows, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
         methods: Appearance of plab's methods by name; reports choose that of others.
     """
@@ -76,12 +74,10 @@ class Family:
     config: type
     runner: type | str
     columns: tuple[str, ...] = ()
-    may_be_nan: tuple[str, ...] = ()
     ranking: str = "loss"
     batching: bool = False
     in_step: bool = False
     rules: Mapping[str, Rule] = field(default_factory=dict)
-    contact: str | None = None
     kind: str = ""
     methods: Mapping[str, Appearance] = field(default_factory=dict)
 

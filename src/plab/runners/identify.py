@@ -244,6 +244,5 @@ FAMILY = Family(
     config=IdentifyConfig,
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
-    may_be_nan=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
     methods={"identify": Appearance("Identify", "#555555", ":")},
 )

@@ -166,6 +166,5 @@ FAMILY = Family(
     config=MpcConfig,
     runner=MpcRunner,
     ranking="score",
-    contact="hard",
     methods={"mpc": Appearance("MPC", "#999999", "--")},
 )

@@ -105,7 +105,6 @@ class Track:
         best_score: Score in their row, if the family ranks by score.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
-        contact: Contact model of the rows.
         log: Log of rows and other numbers, selected by ``logger``.
     """
 
@@ -117,9 +116,7 @@ class Track:
         result = run.result
         columns, rows = result.columns, result.rows
         self.iteration, self.best_loss, self.best_actions = rows, result.best_loss, result.best_actions
-        own = family(cfg.method.family)
-        self.contact = own.contact or cfg.method.contact
-        self._by_score = own.ranking == "score"
+        self._by_score = family(cfg.method.family).ranking == "score"
         known = self._by_score and result.best_iteration >= 0
         self.best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
         self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
@@ -335,15 +332,14 @@ class Runner:
 
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
         """Return the text of progress after an iteration, given the means of its rows by column."""
-        contact = " and ".join(dict.fromkeys(track.contact for track in tracks))
-        text = f"loss {means['loss']:.5g} {contact} score {means['score']:.3f}"
-        if any(track.best_actions is None for track in tracks):
-            # Incomplete episodes of mpc are never the best.
-            return text
+        contact = " and ".join(dict.fromkeys(track.cfg.method.contact for track in tracks))
         best = f"loss {np.mean([track.best_loss for track in tracks]):.5g}"
         if self._family.ranking == "score":
+            contact = "hard"
             best = f"score {np.mean([t.best_score for t in self.tracks if t.error is None]):.3f}"
-        return f"{text} best {best}"
+        text = f"loss {means['loss']:.5g} {contact} score {means['score']:.3f}"
+        # Incomplete episodes of mpc are never the best.
+        return text if any(track.best_actions is None for track in tracks) else f"{text} best {best}"
 
     # ------------------------------------------------------------------------------------ for use in hooks
 

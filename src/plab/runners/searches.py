@@ -337,7 +337,6 @@ FAMILY = Family(
     runner=PlannerRunner,
     ranking="score",
     batching=True,
-    contact="hard",
     rules={
         "multistart": Rule(Multistart, MultistartConfig),
         "cem": Rule(Cem, CemConfig),

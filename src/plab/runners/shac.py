@@ -159,9 +159,7 @@ FAMILY = Family(
     config=ShacConfig,
     runner=ShacRunner,
     columns=("train_reward", "train_score"),
-    may_be_nan=("train_reward", "train_score"),
     rules={"shac": Rule(ShacRunner, ShacConfig)},
-    contact="hard",
     kind=GRADIENT,
     methods={"shac": Appearance("SHAC", "#DDAA33", ":")},
 )
