@@ -12,7 +12,7 @@ import torch
 
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
-from plab.problem import BatchMeasures
+from plab.problem import Episodes
 from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.pods import PodsRunner
@@ -190,14 +190,9 @@ def training() -> PodsRunner:
 
 def test_a_round_improves_actions_and_imitates_them(training: PodsRunner, monkeypatch) -> None:
     plans, tried, problem = [], [], training.batch.problem
-    improve, simulate = training._improved, problem.evaluate_actions
-
-    def evaluate_actions(actions: np.ndarray, gradient: bool) -> BatchMeasures:
-        tried.append(actions)
-        return simulate(actions, gradient=gradient)
-
+    improve, simulate = training._improved, problem.rollout
     monkeypatch.setattr(training, "_improved", lambda *args: plans.append(improve(*args)) or plans[-1])
-    monkeypatch.setattr(problem, "evaluate_actions", evaluate_actions)
+    monkeypatch.setattr(problem, "rollout", lambda own, **how: tried.append(own) or simulate(own, **how))
     training.cycle()
     # Begun as the policy's own, and each update of the method's rate at most.
     assert len(tried) == 3
@@ -241,14 +236,14 @@ def test_environments_that_break_off_teach_nothing(
 ) -> None:
     before = [parameter.clone() for parameter in training.network.parameters()]
     batch, learned = training.batch, []
-    evaluate_actions, imitate = batch.problem.evaluate_actions, training.imitate
+    rollout, imitate = batch.problem.rollout, training.imitate
 
-    def breaking(actions: np.ndarray, gradient: bool) -> BatchMeasures:
-        trials = evaluate_actions(actions, gradient=gradient)
+    def breaking(actions: np.ndarray, **options: bool) -> Episodes:
+        trials = rollout(actions, **options)
         trials.gradient[broken] = np.nan
         return replace(trials, failures={e: f"environment {e}: broke off" for e in broken})
 
-    monkeypatch.setattr(batch.problem, "evaluate_actions", breaking)
+    monkeypatch.setattr(batch.problem, "rollout", breaking)
     monkeypatch.setattr(training, "imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
     training.cycle()
     # Each of the three episodes with gradient.

@@ -59,13 +59,13 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
     losses = rollout(problem, actions)
     losses.sum().backward()
     assert losses.dtype == actions.grad.dtype == torch.float32
-    wanted, intact = [], Problem.evaluate_actions
+    wanted, intact = [], Problem.rollout
 
-    def evaluate_actions(self, tried, *, gradient):
+    def counted(self, tried, *, gradient, **options):
         wanted.append(gradient)
-        return intact(self, tried, gradient=gradient)
+        return intact(self, tried, gradient=gradient, **options)
 
-    monkeypatch.setattr(Problem, "evaluate_actions", evaluate_actions)
+    monkeypatch.setattr(Problem, "rollout", counted)
     assert not rollout(problem, actions.detach()).requires_grad
     with torch.no_grad():
         rollout(problem, actions)
@@ -172,7 +172,7 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     calls = count()
 
     def gradient() -> np.ndarray:
-        return episodes.problem.evaluate_actions(actions, gradient=True).gradient
+        return episodes.problem.rollout(actions, gradient=True).gradient
 
     before = gradient()
 

@@ -394,7 +394,7 @@ def test_worker_processes() -> None:
 
 def test_trials_are_the_simulators_rollouts(env: PlabEnv) -> None:
     problem, actions = env.batch.problem, random_actions()[:, :1].swapaxes(0, 1)
-    tried = problem.evaluate_actions(actions, gradient=False)
+    tried = problem.batch_measures(problem.rollout(actions, gradient=False))
     losses = problem.loss_of(problem.simulator.rollout(actions, gradient=False).step_terms)
-    np.testing.assert_allclose(tried.measures["final_loss"], losses[:, -1])
-    np.testing.assert_allclose(tried.measures["loss"], losses.sum(axis=1))
+    np.testing.assert_allclose(tried["final_loss"], losses[:, -1])
+    np.testing.assert_allclose(tried["loss"], losses.sum(axis=1))

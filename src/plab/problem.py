@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Result of a rollout of all environments, step by step.
+    """Result of a rollout of all environments, step by step, as arrays or, like the actions, CUDA tensors.
 
     Attributes:
         term_names: Names of the terms of the loss.
@@ -68,22 +68,6 @@ class Episodes:
     final_mass: np.ndarray | None
     scores: list[Scores]
     gradient: np.ndarray | None
-    failures: dict[int, str]
-
-
-@dataclass(frozen=True)
-class BatchMeasures:
-    """Measures of many action sequences, as arrays or, like the actions, CUDA tensors.
-
-    Attributes:
-        measures: Measures of the episodes, shape [batch] each: ``loss`` and its terms, ``reward``, ``iou``
-            and ``score``, as in the columns of results, and ``final_loss``, the loss of the last step.
-        gradient: Gradient of ``loss``, shape [batch, T, A], or None.
-        failures: Diverged environments, with time and reason; their values are meaningless.
-    """
-
-    measures: dict[str, Any]
-    gradient: Any
     failures: dict[int, str]
 
 
@@ -317,18 +301,16 @@ class Problem:
             "score": float(self.scores_of(iou)[0][0]),
         }
 
-    def evaluate_actions(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> BatchMeasures:
-        """Return the measures of episodes simulated as in :meth:`rollout`, without an error for divergence.
-        CUDA tensors stay on the device, except failures."""
-        episodes = self.rollout(actions, gradient=gradient, strict=False, exact=False)
+    def batch_measures(self, episodes: Episodes) -> dict[str, Any]:
+        """Return the measures of episodes, shape [batch] each: ``loss`` and its terms, ``reward``, ``iou``
+        and ``score``, as in the columns of results, and ``final_loss``, the loss of the last step."""
         loss, iou = episodes.loss, episodes.iou[:, -1]
-        score, _ = self.scores_of(iou)
         # cumsum() adds in order, while the order of sum() depends on the number of episodes.
         tables = loss, episodes.terms, episodes.reward
         total, summed, reward = (values.cumsum(1)[:, -1] for values in tables)
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
-        measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
-        return BatchMeasures(measures | {"final_loss": loss[:, -1]}, episodes.gradient, episodes.failures)
+        measures = {"loss": total, **by_term, "reward": reward, "iou": iou}
+        return measures | {"score": self.scores_of(iou)[0], "final_loss": loss[:, -1]}
 
     def iou_gradient(self, actions: torch.Tensor) -> tuple[torch.Tensor, dict[int, str]]:
         """Return the gradient of the soft IoU of the last state with the target, shape [batch, T, A], for

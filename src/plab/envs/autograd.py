@@ -53,11 +53,12 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
 class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, problem: Problem, gradient: bool) -> torch.Tensor:
-        result = problem.evaluate_actions(simulator_input(actions, problem.simulator), gradient=gradient)
+        given = simulator_input(actions, problem.simulator)
+        result = problem.rollout(given, gradient=gradient, strict=False, exact=False)
         require_none(result.failures)
         if gradient:
             ctx.save_for_backward(torch.as_tensor(result.gradient).to(actions))
-        return torch.as_tensor(result.measures["loss"]).to(actions)
+        return torch.as_tensor(problem.batch_measures(result)["loss"]).to(actions)
 
     @staticmethod
     def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None, None]:

@@ -76,8 +76,8 @@ class Answer:
     """Evaluation of candidates.
 
     Attributes:
-        measures: Measures of :class:`plab.problem.BatchMeasures`, shape [P] each; none with the gradient of
-            ``score``.
+        measures: Those of :meth:`plab.problem.Problem.batch_measures`, shape [P] each; none with the gradient
+            of ``score``.
         gradient: Requested gradient, shape [P, T, A], 0 for diverged candidates; None if not requested.
         broken: Diverged candidates, shape [P], bool; their values are meaningless.
     """
@@ -360,9 +360,12 @@ class PlannerRunner(Runner):
                 slope, failures = self.problem.iou_gradient(flat)
                 given["gradient"] = -slope
             else:
-                trials = self.problem.evaluate_actions(flat, gradient=first.gradient == "loss")
+                wanted = first.gradient == "loss"
+                trials = self.problem.rollout(flat, gradient=wanted, strict=False, exact=False)
                 failures = trials.failures
-                given |= trials.measures | ({"gradient": trials.gradient} if first.gradient else {})
+                given |= self.problem.batch_measures(trials)
+                if wanted:
+                    given["gradient"] = trials.gradient
             broken[list(failures)] = True
             reasons |= {e % runs: text for e, text in failures.items()}
             for name, values in given.items():

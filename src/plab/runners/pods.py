@@ -121,7 +121,7 @@ class PodsRunner(ImitationRunner):
         optimizer = torch.optim.Adam([plan], lr=rate)
         for _ in range(self.method.updates):
             given = simulator_input(plan, self.batch.problem.simulator)
-            tried = self.batch.problem.evaluate_actions(given, gradient=True)
+            tried = self.batch.problem.rollout(given, gradient=True, strict=False, exact=False)
             self._note_failures(tried.failures)
             plan.grad = torch.as_tensor(tried.gradient, dtype=plan.dtype, device=plan.device)
             # Diverged episodes have no gradient.
