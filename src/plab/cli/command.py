@@ -205,8 +205,7 @@ def finished_rows(sources: Sequence[Path], words: Sequence[str]) -> list[Row]:
     from plab.results.run_table import rows
 
     chosen = select(words, NAMES)
-    found, _ = rows(sources)
-    fitting = [one for one in found if one.values["status"] == "finished" and chosen(one.values, one.config)]
+    fitting = [one for one in rows(sources, chosen)[0] if one.values["status"] == "finished"]
     one_protocol(row.config for row in fitting)
     if not fitting:
         raise ResultsError(f"no finished run in {', '.join(map(str, sources))} matches the selection")

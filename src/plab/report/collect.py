@@ -13,13 +13,13 @@ from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, one_protocol, require_possible
+from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, one_protocol
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, choices, shipped_file, suite_tasks
 from plab.errors import ArgumentError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, rows
 from plab.results.run_file import NAMES
-from plab.results.run_table import sources_of
+from plab.results.run_table import Source, sources_of
 
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that are columns of the table of runs."""
@@ -78,7 +78,7 @@ class Runs:
         return len(self.tasks) * len(self.variants) * len(self.seeds) * len(present)
 
 
-def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split: str = "") -> Runs:
+def collect(source: Source, chosen: Selection, split: str = "") -> Runs:
     """Find the runs for tables and curves.
 
     Args:
@@ -95,24 +95,22 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         plab.config.ConfigError: If the selection cannot match any run.
         plab.results.ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    found, unreadable = rows(source)
-    require_possible(chosen, found)
-    fitting = [row for row in found if chosen(row.values, row.config)]
-    suite, own = suite_tasks(), sorted({row.values["task"] for row in fitting})
+    found, unreadable = rows(source, chosen)
+    suite, own = suite_tasks(), sorted({row.values["task"] for row in found})
     tasks = chosen.choices.get("task", suite if not own or set(own) & set(suite) else own)
-    variants = sorted({str(row.values["variant"]) for row in fitting if row.values["task"] in tasks})
+    variants = sorted({str(row.values["variant"]) for row in found if row.values["task"] in tasks})
     if not variants or set(tasks) & set(choices("task")):
         variants = list(SUITE_VARIANTS)
     free = {
         "task": tasks,
         "variant": variants,
-        "method": ordered(row.values["method"] for row in fitting),
-        "seed": sorted({str(row.values["seed"]) for row in fitting} | set(PAPER_SEEDS), key=int),
+        "method": ordered(row.values["method"] for row in found),
+        "seed": sorted({str(row.values["seed"]) for row in found} | set(PAPER_SEEDS), key=int),
     }
     asked = {name: chosen.choices.get(name, free[name]) for name in NAMES}
-    inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
+    inside = [row for row in found if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
-    ended = [row for row in fitting if row.values["status"] == "finished"]
+    ended = [row for row in found if row.values["status"] == "finished"]
     others = {name: sorted({str(row.values[name]) for row in ended} - set(asked[name])) for name in NAMES}
     advice = " ".join(f"{name}={','.join(texts[:9])}" for name, texts in others.items() if texts)
     methods, seeds = asked["method"], asked["seed"]

@@ -11,7 +11,7 @@ import io
 import lzma
 import math
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,19 +19,16 @@ from typing import Any
 import numpy as np
 
 from plab.config.run import member_name
-from plab.config.selection import Selection, require_possible
+from plab.config.selection import Selection
 from plab.results.run_file import ARCHIVE_SUFFIX, ResultsError, RunResult, encode, read, replace_file
-from plab.results.run_table import Row, rows
+from plab.results.run_table import Row, Source, rows
 
 _FILTER = {"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 4, "pb": 3}
 """Compression of an archive, of numbers of eight bytes: 2.5 % smaller than with preset 9 alone."""
 
 
 def pack(
-    source: str | Path | Sequence[str | Path],
-    archive: str | Path,
-    chosen: Selection | None = None,
-    digits: int | None = None,
+    source: Source, archive: str | Path, chosen: Selection | None = None, digits: int | None = None
 ) -> tuple[int, list[ResultsError]]:
     """Write finished runs into an archive atomically, without mass tensors, which can be recomputed from the
     best actions.
@@ -57,12 +54,10 @@ def pack(
     archive = Path(archive)
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
-    found, unreadable = rows(source)
-    if chosen is not None:
-        require_possible(chosen, found)
+    found, unreadable = rows(source, chosen)
     packed: dict[str, Row] = {}
     for row in found:
-        if row.values["status"] == "finished" and (chosen is None or chosen(row.values, row.config)):
+        if row.values["status"] == "finished":
             name = member_name(row.config, row.values["config_hash"]).as_posix()
             if (other := packed.setdefault(name, row)) is not row:
                 raise ResultsError(f"{row.path} and {other.path} are runs of one configuration: remove one")

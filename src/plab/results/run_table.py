@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import h5py
 import numpy as np
@@ -52,6 +52,9 @@ if TYPE_CHECKING:
     import duckdb
 
 T = TypeVar("T")
+
+Source: TypeAlias = str | Path | Sequence[str | Path]
+"""Folder of results, archive, result file, or several of them."""
 
 _ORIGIN = {"started": "start_time"} | {
     name: name for name in ("device", "precision", "batch", "plab", "git_commit")
@@ -93,9 +96,7 @@ Index = dict[str, Any]
 file) and the two parts of :class:`Row`."""
 
 
-def load(
-    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
-) -> pd.DataFrame:
+def load(source: Source = "results", keys: Sequence[str] = (), *, index: bool = True) -> pd.DataFrame:
     """Load results into a table with one row per run.
 
     Partial files are included, with their status, unless the run also has a finished file; runs in archives
@@ -137,13 +138,15 @@ def warn_of(unreadable: Sequence[ResultsError]) -> None:
 
 
 def rows(
-    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
+    source: Source = "results", chosen: Selection | None = None, *, index: bool = True
 ) -> tuple[list[Row], list[ResultsError]]:
-    """Return the rows of :func:`load` with their configurations, and the errors of unreadable files.
+    """Return the rows of :func:`load`, or the chosen ones, with their configurations, and the errors of
+    unreadable files.
 
     Files are read in full first, so that their iterations and actions are known to be readable.
 
     Raises:
+        ArgumentError: If the selection cannot match any run.
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
     roots = sources_of(source)
@@ -152,10 +155,14 @@ def rows(
     unreadable = [entry for entry in entries if isinstance(entry, ResultsError)]
     if unreadable and not found and not any(root.is_dir() for root in roots):
         raise unreadable[0]
-    return _without_repetitions(found), unreadable
+    found = _without_repetitions(found)
+    if chosen is not None:
+        require_possible(chosen, found)
+        found = [row for row in found if chosen(row.values, row.config)]
+    return found, unreadable
 
 
-def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
+def sources_of(source: Source) -> list[Path]:
     """Return folders, archives and files, with names such as ``example`` replaced by bundled archives."""
     given = [source] if isinstance(source, str | Path) else source
     return [resolve(one) if isinstance(one, str) else one for one in given]
@@ -335,9 +342,7 @@ def _index_place(root: Path) -> Path:
 # -------------------------------------------------------------------------------------------------------- SQL
 
 
-def connect(
-    source: str | Path | Sequence[str | Path] = "results", *, iterations: bool = False
-) -> duckdb.DuckDBPyConnection:
+def connect(source: Source = "results", *, iterations: bool = False) -> duckdb.DuckDBPyConnection:
     """Return an in-memory DuckDB database with the tables of docs/results.md; result files are only read.
 
     Args:
@@ -355,9 +360,7 @@ def connect(
     return connection
 
 
-def query(
-    source: str | Path | Sequence[str | Path], sql: str
-) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
+def query(source: Source, sql: str) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
     """Run an SQL query on the tables of :func:`connect`.
 
     Returns:
@@ -388,7 +391,7 @@ def query(
 
 
 def scores(
-    source: str | Path | Sequence[str | Path],
+    source: Source,
     chosen: Selection,
     keys: Sequence[str] = (),
     sort: Sequence[str] = (),
@@ -413,16 +416,14 @@ def scores(
             ``sort`` does not exist.
         ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
     """
-    found, unreadable = rows(source)
-    require_possible(chosen, found)
-    fitting = [row for row in found if chosen(row.values, row.config)]
+    found, unreadable = rows(source, chosen)
     looked_up = {key: key for key in keys} | _SETTINGS
     columns = list(dict.fromkeys((*NAMES, *_SETTINGS, "status", "score", *keys)))
     values = [
-        {name: lookup(row.config, key) for name, key in looked_up.items()} | row.values for row in fitting
+        {name: lookup(row.config, key) for name, key in looked_up.items()} | row.values for row in found
     ]
     table = pd.DataFrame(values, columns=columns)
-    if strange := [key for key in keys if fitting and table[key].isna().all()]:
+    if strange := [key for key in keys if found and table[key].isna().all()]:
         raise ArgumentError(f"no run has '{strange[0]}': use columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
         raise ArgumentError(f"there is no column '{missing[0]}' to sort by: add it to --keys")

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from plab.config.families import SOLVED
-from plab.config.selection import Selection, one_protocol, require_possible
+from plab.config.selection import Selection, one_protocol
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.errors import printable
 from plab.plugins import pandas as pd
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
-from plab.results.run_table import rows
+from plab.results.run_table import Source, rows
 from plab.results.running import held
 
 __all__ = ["NAMES", "STATES", "Survey", "survey"]
@@ -86,7 +85,7 @@ class Survey:
         return max(left / self.workers, longest)
 
 
-def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, missing: bool = False) -> Survey:
+def survey(source: Source, chosen: Selection, *, missing: bool = False) -> Survey:
     """Find the state of the requested runs.
 
     Args:
@@ -99,19 +98,17 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
         ResultsError: If ``source`` does not exist, or is an unreadable file or archive.
         ArgumentError: If there are runs of several protocols, or the selection cannot match any run.
     """
-    found, unreadable = rows(source)
-    require_possible(chosen, found)
-    fitting = [row for row in found if chosen(row.values, row.config)]
-    keys = [tuple(str(row.values[name]) for name in NAMES) for row in fitting]
+    found, unreadable = rows(source, chosen)
+    keys = [tuple(str(row.values[name]) for name in NAMES) for row in found]
     runs = {key: dict(zip(NAMES, key, strict=True)) | _MISSING for key in _expected(keys, chosen, missing)}
     others = 0
-    for key, row in zip(keys, fitting, strict=True):
+    for key, row in zip(keys, found, strict=True):
         run, state = runs.get(key), _state(row)
         others += run is None or run["state"] != "missing"
         # Among several settings of the same run, the one with the best state counts.
         if run is not None and STATES.index(state) < STATES.index(run["state"]):
             runs[key] = run | _described(row, state)
-    protocol = one_protocol(row.config for row in fitting)
+    protocol = one_protocol(row.config for row in found)
     table = pd.DataFrame(list(runs.values()), columns=[*NAMES, *_MISSING])
     return Survey(_with_estimates(table), others, [str(error) for error in unreadable], protocol)
 
