@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,7 @@ from plab.config.selection import select
 from plab.report import statistics
 from plab.report.collect import NAMES, collect
 from plab.report.figures import rl_scores, style
-from plab.report.statistics import at_budgets, band, common_strata, improvement, interquartile_mean
+from plab.report.statistics import at_budgets, band, improvement, interquartile_mean, shared_strata
 from plab.report.tables import score_at_budget
 
 
@@ -121,14 +122,12 @@ def test_improvement_is_the_mann_whitney_statistic() -> None:
 
 
 def test_methods_are_compared_on_what_they_share() -> None:
-    scores = {
-        "adam": {("Rope", "1"): np.ones(3), ("Rope", "2"): np.zeros(3)},
-        "gd": {("Rope", "2"): np.full(2, 0.5)},
-    }
-    keys, strata = common_strata(scores)
-    assert keys == [("Rope", "2")] and strata["adam"][0].tolist() == [0.0] * 3
-    keys, strata = common_strata(scores | {"sac": {("Move", "1"): np.ones(1)}})
-    assert keys == [("Rope", "2")] and set(strata) == {"adam", "gd"}
+    rows = [("Rope", "1", "adam", 1.0), *[("Rope", "2", "adam", 0.0)] * 3, *[("Rope", "2", "gd", 0.5)] * 2]
+    for others in [], [("Move", "1", "sac", 1.0)]:
+        table = pd.DataFrame([*rows, *others], columns=["task", "variant", "method", "score"])
+        strata, notes = shared_strata(SimpleNamespace(table=table, methods=["gd", "adam", "sac"]))
+        assert {name: own[0].tolist() for name, own in strata.items()} == {"gd": [0.5] * 2, "adam": [0.0] * 3}
+        assert ("SAC (0 of 1)" in notes[1]) == bool(others)
 
 
 @pytest.fixture(scope="module")

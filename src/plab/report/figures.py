@@ -228,7 +228,7 @@ def aggregates(runs: Runs) -> list[Drawing]:
     """Return interquartile means and probabilities of improvement."""
     strata, notes = shared_strata(runs)
     notes += settings_note(runs)
-    return [_interquartile_means(strata, notes), _improvements(strata, notes)] if strata else []
+    return [_interquartile_means(strata, notes), _improvements(strata, notes)]
 
 
 def _interquartile_means(strata: Mapping[str, Strata], notes: list[str]) -> Drawing:

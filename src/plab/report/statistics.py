@@ -145,17 +145,28 @@ def _interval(value: float, samples: np.ndarray) -> Interval:
 
 
 def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Return the scores of the runs by method, for the methods and configurations selected by
-    :func:`common_strata`, and notes on included and missing runs."""
-    scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
-    for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
-        scores[name][task, variant] = own["score"].to_numpy(float)
-    keys, strata = common_strata({name: scores[name] for name in runs.methods if name in scores})
+    """Return the scores of some methods by configuration, for the configurations for which all of them have
+    runs, and notes on included and missing runs.
+
+    Methods are ordered by the number of configurations that they share with the method that has the most. The
+    selection maximises the number of pairs of a method and a common configuration, and has at least two
+    methods if any share a configuration.
+    """
+    scores = runs.table.groupby(["task", "variant", "method"])["score"].apply(np.array).unstack()
+    known = scores[[name for name in runs.methods if name in scores]].notna()
+    most = known.sum().idxmax()
+    order = known[known[most]].sum().sort_values(ascending=False, kind="stable").index
+    # Whether the first 1, 2, ... methods all have runs of a configuration.
+    common = np.logical_and.accumulate(known[order], axis=1)
+    shared = common.sum().to_numpy()
+    last = max(np.flatnonzero(shared), key=lambda k: (k > 0, (k + 1) * shared[k], k))
+    keys, shown = known.index[common[order[last]]], set(order[: last + 1])
+    strata = {name: scores.loc[keys, name].to_list() for name in known if name in shown}
     counts = [f"{method(name).label} {sum(map(len, own))}" for name, own in strata.items()]
     apart = [
-        f"{method(name).label} ({sum(key in scores[name] for key in keys)} of {len(keys)})"
-        for name in runs.methods
-        if name in scores and name not in strata
+        f"{method(name).label} ({known.loc[keys, name].sum()} of {len(keys)})"
+        for name in known
+        if name not in strata
     ]
     notes = [
         f"Over the {len(keys)} configurations with runs of all methods shown; runs per method: "
@@ -167,32 +178,6 @@ def shared_strata(runs: Runs) -> tuple[dict[str, list[np.ndarray]], list[str]]:
     if any(len(scores) < 2 for own in strata.values() for scores in own):
         notes.append("Intervals do not include the spread of configurations with a single run.")
     return strata, notes
-
-
-def common_strata(
-    scores: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
-) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
-    """Return configurations for which several methods have runs, and the scores of these methods.
-
-    Methods are ordered by the number of configurations that they share with the method that has the most. The
-    selection maximises the number of pairs of a method and a common configuration, and has at least two
-    methods if any share a configuration.
-
-    Args:
-        scores: Scores by method and configuration, shape [run] each.
-
-    Returns:
-        The configurations, and by method the scores of each configuration.
-    """
-    if not scores:
-        return [], {}
-    most = max(scores.values(), key=len)
-    order = sorted(scores, key=lambda name: -len(scores[name].keys() & most.keys()))
-    common = [set.intersection(*(set(scores[name]) for name in order[: k + 1])) for k in range(len(order))]
-    shared = (k for k in range(len(order)) if common[k])
-    last = max(shared, key=lambda k: (k > 0, (k + 1) * len(common[k]), k))
-    keys, shown = sorted(common[last]), set(order[: last + 1])
-    return keys, {name: [own[key] for key in keys] for name, own in scores.items() if name in shown}
 
 
 # ------------------------------------------------------------------------------------------------ iterations
