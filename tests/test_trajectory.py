@@ -80,17 +80,17 @@ def test_rules_are_adam_and_momentum(method, optimizer: str) -> None:
 
 
 def test_no_better_score_is_given_up() -> None:
-    rng, finalists, shown = np.random.default_rng(0), trajectory.Finalists(), []
+    rng, score, loss, shown = np.random.default_rng(0), np.nan, np.nan, []
     for iteration in range(30):
-        soft, loss = rng.random(2)
-        finalists.add(trajectory.Finalist(np.full((2, 1), soft), iteration, loss, soft))
-        if iteration % trajectory.CHECK_INTERVAL == trajectory.CHECK_INTERVAL - 1:
-            for one in (finalists.highest, finalists.lowest):
-                one.hard_score = float(rng.random())
-                shown.append(one.hard_score)
-            finalists.keep_best()
-            finalists = trajectory.Finalists.of(finalists.state())
-        assert not shown or finalists.kept_score == max(shown)
+        hard = rng.random(2)
+        shown += hard.tolist()
+        finalists = {
+            name: trajectory.Finalist(np.zeros((2, 1)), iteration, *rng.random(2), own)
+            for name, own in zip(trajectory.RANKINGS, hard, strict=True)
+        }
+        if best := trajectory.best_finalist(finalists, score, loss):
+            score, loss = best.hard_score, best.loss
+        assert score == max(shown) and trajectory.best_finalist(finalists, score, loss) is None
 
 
 def test_file_holds_the_whole_run(finished: RunResult) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -73,7 +73,7 @@ class TrajectoryRunner(Runner):
         super().build()
         self._set_contact()
         self._rules: dict[int, UpdateRule] = {}
-        self._finalists: dict[int, Finalists] = {}
+        self._finalists: dict[int, dict[str, Finalist]] = {}
         # Actions of the last iteration.
         self._before: dict[int, np.ndarray] = {}
 
@@ -87,11 +87,11 @@ class TrajectoryRunner(Runner):
         method = track.cfg.method_as(TrajectoryConfig)
         kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
         rule = self._rules[track.number] = kind(method, (scene.horizon, scene.action_dim), track.cfg.seed)
-        self._finalists[track.number] = Finalists()
+        known = {} if state is None else state["finalists"]
+        self._finalists[track.number] = {name: Finalist(**known[name]) for name in RANKINGS if name in known}
         if state is not None:
             rule.actions = np.array(state["actions"])
             rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
-            self._finalists[track.number] = Finalists.of(state["finalists"])
             self._before[track.number] = np.array(state["before"])
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
@@ -121,7 +121,9 @@ class TrajectoryRunner(Runner):
             rows[track] = row = measures(episodes, number)
             row["gradient_norm"] = float(np.linalg.norm(gradient))
             new = Finalist(tried[number].copy(), track.iteration, row["loss"], row["score"])
-            self._finalists[number].add(new)
+            finalists = self._finalists[number]
+            for name, rank in RANKINGS.items():
+                finalists[name] = min(finalists.get(name, new), new, key=rank)
         # The release scores the last iteration, whichever actions are kept.
         judging = [track for track in rows if track.cfg.protocol.score != "last"]
         ahead = {track: self.iterations(track) - track.iteration - 1 for track in judging}
@@ -129,18 +131,23 @@ class TrajectoryRunner(Runner):
         checks = self._check(due, [track for track in due if ahead[track] == 0])
         for track, row in rows.items():
             rule, finalists = self._rules[track.number], self._finalists[track.number]
-            kept = finalists.keep_best() if track in checks else None
+            result, kept = track.run.result, None
+            kept_score = float(result.columns["kept_score"][-1]) if result.rows else np.nan
+            if track in checks:
+                kept = best_finalist(finalists, kept_score, track.best_loss)
+                kept_score = kept_score if kept is None else kept.hard_score
+                del finalists["highest"]
             if ahead.get(track) == 0:
-                track.run.result.provenance["lowest_loss_score"] = cast(Finalist, finalists.lowest).hard_score
+                result.provenance["lowest_loss_score"] = finalists["lowest"].hard_score
             step = Step(
-                row | {"kept_score": finalists.kept_score},
+                row | {"kept_score": kept_score},
                 tried[track.number],
                 {"actions": rule.actions, "before": tried[track.number], "optimizer": dict(rule.state)}
-                | {"finalists": finalists.state()},
+                | {"finalists": {name: vars(one) for name, one in finalists.items()}},
                 steps_forward=checks.get(track, 0) * len(rule.actions),
                 steps_gradient=(1 + repeated[track.number]) * len(rule.actions),
                 # Before the first check, the actions with the lowest loss are kept.
-                whole=np.isnan(finalists.kept_score) or track not in judging,
+                whole=np.isnan(kept_score) or track not in judging,
                 best=None if kept is None else (kept.actions, kept.iteration, kept.loss),
             )
             yield track, step
@@ -150,7 +157,7 @@ class TrajectoryRunner(Runner):
         and, for runs that end, those with the lowest loss. Return the rollouts of each run."""
         rollouts = dict.fromkeys(tracks, 0)
         for name, some in (("highest", tracks), ("lowest", ending)):
-            chosen: dict[Track, Finalist] = {t: getattr(self._finalists[t.number], name) for t in some}
+            chosen = {track: self._finalists[track.number][name] for track in some}
             tried = self.actions_at_rest()
             for track, one in chosen.items():
                 tried[track.number], one.hard_score = one.actions, one.score
@@ -166,7 +173,7 @@ class TrajectoryRunner(Runner):
         return rollouts
 
     def summary_line(self, means: Mapping[str, float], tracks: Sequence[Track]) -> str:
-        """Return the loss, and the score of the kept actions; see :class:`Finalists`."""
+        """Return the loss, and the score of the kept actions; see :data:`RANKINGS`."""
         if all(track.cfg.protocol.score == "last" for track in tracks):
             return super().summary_line(means, tracks)
         kept = f" score of the best actions {means['kept_score']:.3f}" if means["kept_score"] >= 0.0 else ""
@@ -185,52 +192,27 @@ class Finalist:
     hard_score: float = np.nan
 
 
-@dataclass
-class Finalists:
-    """Candidates for the best actions of a run.
+RANKINGS: dict[str, Callable[[Finalist], Any]] = {
+    "highest": lambda one: (-one.score, one.loss),
+    "lowest": lambda one: one.loss,
+}
+"""Candidates for the best actions of a run: those with the highest score since the last check, in the contact
+model of the rows, and those with the lowest loss.
 
-    The score of a row is that of its contact model. A check evaluates the actions of the highest score since
-    the last check in the hard contact model; the last check also evaluates the actions of the lowest loss.
-    The actions with the highest score there are kept, with ties broken by loss.
+A check evaluates the first in the hard contact model, the last check also the second. The actions with the
+highest score there are kept, with ties broken by loss.
+"""
 
-    Attributes:
-        highest: Actions with the highest score since the last check, or None.
-        lowest: Actions with the lowest loss.
-        kept_score: Score of the kept actions in the hard contact model; NaN before the first check.
-        kept_loss: Loss of the kept actions.
-    """
 
-    highest: Finalist | None = None
-    lowest: Finalist | None = None
-    kept_score: float = np.nan
-    kept_loss: float = np.nan
-
-    def add(self, new: Finalist) -> None:
-        """Consider the actions of an iteration."""
-        self.highest = min(self.highest or new, new, key=lambda one: (-one.score, one.loss))
-        self.lowest = min(self.lowest or new, new, key=lambda one: one.loss)
-
-    def keep_best(self) -> Finalist | None:
-        """Return the checked finalist if it is better than the kept actions, and reset the highest score."""
-        best = None
-        for one in filter(None, (self.highest, self.lowest)):
-            better = not one.hard_score <= self.kept_score or (
-                one.hard_score == self.kept_score and one.loss < self.kept_loss
-            )
-            if one.hard_score >= 0.0 and better:
-                best, self.kept_score, self.kept_loss = one, one.hard_score, one.loss
-        self.highest = None
+def best_finalist(finalists: Mapping[str, Finalist], score: float, loss: float) -> Finalist | None:
+    """Return the best checked finalist if it is better than the kept actions, given their score in the hard
+    contact model, NaN before the first check, and their loss."""
+    known = [finalists[name] for name in RANKINGS if name in finalists]
+    checked = [one for one in known if one.hard_score >= 0.0]
+    best = min(checked, key=lambda one: (-one.hard_score, one.loss), default=None)
+    if best is None or np.isnan(score) or (-best.hard_score, best.loss) < (-score, loss):
         return best
-
-    def state(self) -> dict[str, Any]:
-        """Return the full state as arrays and numbers."""
-        return {n: vars(v) if isinstance(v, Finalist) else v for n, v in vars(self).items() if v is not None}
-
-    @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Finalists:
-        """Restore from a result of :meth:`state`."""
-        own: dict[str, Any] = {n: Finalist(**v) if isinstance(v, Mapping) else v for n, v in state.items()}
-        return cls(**own)
+    return None
 
 
 class UpdateRule:
