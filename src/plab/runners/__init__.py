@@ -142,4 +142,5 @@ def _execute(tracks: Sequence[Track], note: str, cache: SimulatorCache | None) -
         raise
     finally:
         for track in tracks:
+            track.log.close()
             track.run.release()

@@ -14,7 +14,7 @@ import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -375,9 +375,7 @@ class Runner:
         from plab.config.compose import require_runnable
         from plab.sim import DeviceError
 
-        with self.context(), simulation_errors(), ExitStack() as logs:
-            for track in self.tracks:
-                logs.callback(track.log.close)
+        with self.context(), simulation_errors():
             try:
                 try:
                     with self._progress(" build"), simulation_errors():
@@ -582,13 +580,12 @@ class RunLog:
     def __init__(self, cfg: Config, run: RunFile) -> None:
         """Store the run's configuration and file."""
         self._cfg, self._run = cfg, run
-        self.wanted = cfg.logger != "none"
         self._write: Callable[[Mapping[str, float], int], object] | None = None
         self._close: Callable[[], object] = lambda: None
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
         """Log finite numbers by name at an environment step; raise ResultsError on failure."""
-        if not self.wanted:
+        if self._cfg.logger == "none":
             return
         try:
             if self._write is None:
