@@ -320,18 +320,15 @@ def opened(path: Path) -> Iterator[h5py.File]:
             regular_file(path)
             file = h5py.File(path, "r")
         else:
-            file = h5py.File(h5py.h5f.open_file_image(_member(*inside)))
+            archive, name = inside
+            # Errors of the archive name only the archive.
+            members = opened_archive(archive)
+            if name not in members.NameToInfo:
+                raise ResultsError(f"{archive} has no run {name}")
+            file = h5py.File(h5py.h5f.open_file_image(member_bytes(members, name)))
         with file:
             _require_version(file, path)
             yield file
-
-
-def _member(archive: Path, name: str) -> bytes:
-    """Return a member of an archive; errors of the archive name only the archive."""
-    members = opened_archive(archive)
-    if name not in members.NameToInfo:
-        raise ResultsError(f"{archive} has no run {name}")
-    return member_bytes(members, name)
 
 
 def opened_archive(path: Path) -> zipfile.ZipFile:

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -184,10 +184,7 @@ class Submission:
 
 # ------------------------------------------------------------------------------------------------- files
 
-_CARD_KINDS = {
-    **dict.fromkeys(("name", "link", "hardware", "description"), str),
-    **{"authors": list, "budget": int, "gradient": bool},
-}
+_CARD_KINDS = {name: get_origin(kind) or kind for name, kind in get_type_hints(Card).items()}
 
 
 def _require(fits: bool, fault: str) -> None:
