@@ -35,8 +35,11 @@ if TYPE_CHECKING:
     import pandas
     import scipy
     import torch
+    from torch import Tensor
 else:
     pandas, scipy, torch = map(LazyModule, ("pandas", "scipy", "torch"))
+    # For annotations only, which are not evaluated.
+    Tensor = Any
 
 
 class Registry(UserDict[str, Any]):

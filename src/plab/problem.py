@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,13 +30,10 @@ from plab.objective import (
     total_loss,
 )
 from plab.plugins import torch
-from plab.scenes import SceneError
+from plab.scenes import Scene, SceneError
 from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, check_target, load_release_target
-
-if TYPE_CHECKING:
-    from plab.scenes import Scene
 
 FIRST_SCENE = 1000
 """``seed_scene`` of the first random scene of ``method.scenes`` and of ``task.randomize.scenes``."""

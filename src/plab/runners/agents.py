@@ -20,14 +20,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from plab.config import Config, ranges
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.results import ResultsError
 from plab.runners.policy import Policy, PolicyConfig, Spaces, first_policy
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
-    from torch import Tensor, nn
-    from torch.optim import Adam
 
 LARGEST = 2**62
 """Bound of the random integers that are reduced modulo the requested range; uniform to 1e-12."""
@@ -247,7 +245,7 @@ out], to avoid transposing products and gradients."""
 
 
 def stacked(
-    policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
+    policies: Sequence[torch.nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
 ) -> dict[str, Part]:
     """Return the stacked parameters of policies of one kind, by part: a module, or several modules of the
     same shape.
@@ -307,7 +305,7 @@ def critic_values(tensors: Iterable[Tensor], observations: Tensor, actions: Tens
     return values.view(agents, critics, -1)
 
 
-def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
+def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> torch.optim.Adam:
     """Return Adam for stacked parameters, with preallocated state; one step updates all agents and can be
     captured on CUDA."""
     cuda, device = parameters[0].is_cuda, parameters[0].device
@@ -319,7 +317,7 @@ def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
     return optimizer
 
 
-def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> None:
+def descend(optimizer: torch.optim.Adam, losses: Tensor, longest: float | None = None) -> None:
     """Make an optimiser step on the independent losses of the agents, shape [agent], with each agent's
     gradient clipped to the norm ``longest``."""
     parameters = optimizer.param_groups[0]["params"]
@@ -405,7 +403,7 @@ class Agents:
     LOSSES: ClassVar[Sequence[str]]
     """Names of the losses returned by an update, as in Stable-Baselines3's logs."""
 
-    optimizers: dict[str, Adam]
+    optimizers: dict[str, torch.optim.Adam]
 
     def __init__(
         self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device, total_steps: int

@@ -17,17 +17,14 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family
 from plab.runners.runner import Runner, Step, Track, shared_problem
-from plab.scenes import SceneError
-
-if TYPE_CHECKING:
-    from plab.scenes import Camera, Scene
+from plab.scenes import Camera, Scene, SceneError
 
 PARAMETERS = (
     *("youngs_modulus", "poisson_ratio", "yield_stress"),

@@ -11,19 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family, family
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.planner import Asking, Planner, PlannerRunner, Request, make_planner
 from plab.runners.runner import Step, Track
 from plab.runners.trajectory import TrajectoryConfig
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass

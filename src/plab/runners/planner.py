@@ -19,13 +19,11 @@ import numpy as np
 
 from plab.config import ConfigError, MethodConfig, build_scene, ranges
 from plab.config.families import family
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.policy import torch_settings
 from plab.runners.runner import Runner, Step, Track, shared_problem
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from plab.problem import Episodes
     from plab.runners.contact_starts import ContactStarts
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
+from gymnasium.spaces import Box
 from omegaconf import OmegaConf
 
 from plab.config import MethodConfig, ranges
@@ -31,9 +32,7 @@ from plab.results.run_file import explained, replace_file
 from plab.scenes import DEVICES
 
 if TYPE_CHECKING:
-    from gymnasium.spaces import Box
     from stable_baselines3.common.policies import BasePolicy
-    from torch.optim import Optimizer
 
     from plab.envs.core import EpisodeBatch
 
@@ -81,7 +80,7 @@ class Spaces(NamedTuple):
     @classmethod
     def of(cls, batch: EpisodeBatch) -> Spaces:
         """Return the spaces of a batch with vector observations."""
-        return cls(cast("Box", batch.observation_space), batch.action_space)
+        return cls(cast(Box, batch.observation_space), batch.action_space)
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -108,7 +107,7 @@ def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
         torch.distributions.Distribution.set_default_validate_args(checks)
 
 
-def set_rate(optimizer: Optimizer, rate: float) -> None:
+def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
     """Set the learning rate of all parameters, in place if it is a tensor."""
     for group in optimizer.param_groups:
         if isinstance(group["lr"], torch.Tensor):
@@ -154,7 +153,7 @@ class Policy:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return actions, shape [env, action], for observations from environments, shape [env, entry]."""
-        entries, wanted = np.shape(observation)[-1], cast("Box", self.network.observation_space).shape[0]
+        entries, wanted = np.shape(observation)[-1], cast(Box, self.network.observation_space).shape[0]
         if entries != wanted:
             raise ArgumentError(
                 f"observations have {entries} entries, those of the policy's training {wanted}: "
@@ -176,7 +175,7 @@ def save_policy(result: Path, method: PolicyConfig, policy: Policy) -> None:
     on failure."""
     arrays: dict[str, Any] = {"header": np.array(json.dumps({"format": _FORMAT, "method": asdict(method)}))}
     for name in ("observation", "action"):
-        space = cast("Box", getattr(policy.network, f"{name}_space"))
+        space = cast(Box, getattr(policy.network, f"{name}_space"))
         arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
     if policy.mean is not None:
         arrays |= {"mean": policy.mean, "variance": policy.variance}
@@ -226,8 +225,6 @@ def _policy(path: Path) -> Policy:
     merged = OmegaConf.merge(OmegaConf.structured(own.config_type(section["algorithm"])), section)
     method = cast(PolicyConfig, OmegaConf.to_object(merged))
     method.check("method")
-    from gymnasium.spaces import Box
-
     spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
     kept = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in kept}

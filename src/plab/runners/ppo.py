@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from plab.config import ConfigError, ranges
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.agents import Agents, RlConfig, adam, descend, linear, mlp
 from plab.runners.policy import CLIP, EPSILON, Policy, Spaces, set_rate
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 ACTION_GAIN = 0.01
 """Stable-Baselines3's gain of the last layer of PPO's policy; that of the value function is 1."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config.families import RL, Appearance, Family, Rule, family
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, ReplayBuffer, RlConfig, Sizes
 from plab.runners.policy import Policy, Spaces
 from plab.runners.ppo import PpoAgents, PpoConfig
@@ -26,8 +26,6 @@ from plab.runners.td3 import Td3Agents, Td3Config
 from plab.runners.training import PolicyRunner
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from plab.envs.core import EpisodeBatch, Transition
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.agents import (
     OffPolicyAgents,
     OffPolicyConfig,
@@ -17,9 +17,6 @@ from plab.runners.agents import (
     mlp,
 )
 from plab.runners.policy import Spaces
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 LOG_STD = -20.0, 2.0
 """Smallest and largest logarithm of a standard deviation."""

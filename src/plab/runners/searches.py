@@ -22,12 +22,11 @@ import numpy as np
 
 from plab.config import ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.planner import Asking, Planner, PlannerConfig, PlannerRunner, Request, Stages, StagesConfig
 
 if TYPE_CHECKING:
     from cmaes import CMA
-    from torch import Tensor
 
 CURVES = ("constant", "linear")
 

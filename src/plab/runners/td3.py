@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from plab.config import ranges
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, adam, critic_values, descend, follow, mlp
 from plab.runners.policy import Spaces
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass

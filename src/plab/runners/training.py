@@ -21,7 +21,7 @@ import numpy as np
 from plab.config import Config, ConfigError, build_scene, ranges
 from plab.config.randomization import without_draws
 from plab.config.selection import OBSERVATION_KEYS
-from plab.plugins import torch
+from plab.plugins import Tensor, torch
 from plab.results.run_file import REPLAY_SUFFIX
 from plab.runners.policy import (
     CLIP,
@@ -46,8 +46,6 @@ from plab.runners.runner import (
 )
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from plab.envs.core import EpisodeBatch
     from plab.envs.tensors import TensorEnv
     from plab.runners.agents import ReplayBuffer
