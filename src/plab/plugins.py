@@ -32,12 +32,13 @@ class LazyModule(ModuleType):
 
 
 if TYPE_CHECKING:
+    import duckdb
     import pandas
     import scipy
     import torch
     from torch import Tensor
 else:
-    pandas, scipy, torch = map(LazyModule, ("pandas", "scipy", "torch"))
+    duckdb, pandas, scipy, torch = map(LazyModule, ("duckdb", "pandas", "scipy", "torch"))
     # For annotations only, which are not evaluated.
     Tensor = Any
 

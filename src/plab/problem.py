@@ -335,8 +335,6 @@ class Problem:
     def _target_like(self, mass: torch.Tensor) -> torch.Tensor:
         """Return the targets' masses relative to the largest of each, shape [batch, 1, n, n, n], on the
         device of a tensor, to which they are copied once."""
-        from plab.plugins import torch
-
         known = self._relative_target
         if known is None or known[0] is not self.target_mass:
             target = np.asarray(self.target_mass, np.float64)[:, None]

@@ -17,7 +17,7 @@ from plab.config.selection import OBSERVATION_KEYS, Selection, leaves, lookup, o
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, choices, shipped_file, suite_tasks
 from plab.errors import ArgumentError
 from plab.report.methods import method, ordered, part
-from plab.results import Row, rows
+from plab.results import Row, config_dict, rows
 from plab.results.run_file import NAMES
 from plab.results.run_table import Source, sources_of
 
@@ -254,7 +254,6 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     # Composing needs Hydra.
     from plab.config import load_config
     from plab.config.overrides import quoted
-    from plab.results import config_dict
 
     chosen = {"method": method, "protocol": protocol}
     chosen = {group: name for group, name in chosen.items() if name in choices(group)}

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import h5py
 import numpy as np
@@ -27,6 +27,7 @@ from plab.config.run import SUFFIX
 from plab.config.selection import Selection, leaves, lookup, require_possible
 from plab.errors import ArgumentError
 from plab.files import cache_dir
+from plab.plugins import duckdb
 from plab.plugins import pandas as pd
 from plab.results.examples import resolve
 from plab.results.run_file import (
@@ -47,9 +48,6 @@ from plab.results.run_file import (
     summary_of,
 )
 from plab.results.run_file import COLUMNS as ITERATION_COLUMNS
-
-if TYPE_CHECKING:
-    import duckdb
 
 T = TypeVar("T")
 
@@ -370,8 +368,6 @@ def query(source: Source, sql: str) -> tuple[list[str], list[tuple[Any, ...]], l
         ArgumentError: If the query is invalid.
         ResultsError: As for :func:`connect`.
     """
-    import duckdb
-
     try:
         # Opening every file is slow, so it is done only for queries of this table.
         connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
@@ -445,8 +441,6 @@ _TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "pr
 def _connected(
     sources: Sequence[Path], iterations: bool
 ) -> tuple[duckdb.DuckDBPyConnection, list[ResultsError]]:
-    import duckdb
-
     found, unreadable = rows(sources)
     runs, config = [], []
     for run, row in enumerate(found):

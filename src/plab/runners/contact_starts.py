@@ -14,10 +14,8 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
-from scipy.spatial.transform import Rotation
 
+from plab.plugins import scipy
 from plab.scenes import ROLL_RADIUS, Manipulator, Scene, sample_particles
 from plab.targets.scripted import ActionTrack
 
@@ -108,7 +106,8 @@ class ContactStarts:
         held = {self._owner(tool) for tool in self._tools} or set(body.tolist())
         weight = np.where(np.isin(body, list(held)), 1.0, UNREACHED_COST)[:, None]
         for _ in range(ALIGNMENTS if len(scene.bodies) > 1 else 1):
-            _, assigned = linear_sum_assignment(weight * cdist(points + moved, goals, "sqeuclidean"))
+            distances = scipy.spatial.distance.cdist(points + moved, goals, "sqeuclidean")
+            _, assigned = scipy.optimize.linear_sum_assignment(weight * distances)
             ways = goals[assigned] - points
             # Bodies stay whole: the next assignment uses the residuals after each body's mean displacement.
             moved = _middle_ways(ways, body)[body]
@@ -183,8 +182,8 @@ def _middle_ways(ways: np.ndarray, body: np.ndarray) -> np.ndarray:
     return np.stack([np.median(ways[body == b], axis=0) for b in np.unique(body)])
 
 
-def _rotation(tool: Manipulator) -> Rotation:
-    return Rotation.from_quat(tool.rotation, scalar_first=True)
+def _rotation(tool: Manipulator) -> scipy.spatial.transform.Rotation:
+    return scipy.spatial.transform.Rotation.from_quat(tool.rotation, scalar_first=True)
 
 
 def _action(tool: Manipulator, way: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family, family
 from plab.plugins import Tensor, torch
+from plab.runners.contact_starts import ContactStarts
 from plab.runners.planner import Asking, Planner, PlannerRunner, Request, make_planner
 from plab.runners.runner import Step, Track
 from plab.runners.trajectory import TrajectoryConfig
@@ -99,8 +100,6 @@ class MpcRunner(PlannerRunner):
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Plan from the current state, and execute the first steps."""
-        from plab.runners.contact_starts import ContactStarts
-
         method, (track,) = self.method, self.tracks
         scene, taken = self.problem.scenes[0], len(self._executed)
         ahead = min(method.window, scene.horizon - taken)

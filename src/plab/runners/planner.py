@@ -20,12 +20,12 @@ import numpy as np
 from plab.config import ConfigError, MethodConfig, build_scene, ranges
 from plab.config.families import family
 from plab.plugins import Tensor, torch
+from plab.runners.contact_starts import ContactStarts
 from plab.runners.policy import torch_settings
 from plab.runners.runner import Runner, Step, Track, shared_problem
 
 if TYPE_CHECKING:
     from plab.problem import Episodes
-    from plab.runners.contact_starts import ContactStarts
 
 OBJECTIVES = ("loss", "final", "score")
 
@@ -276,8 +276,6 @@ class PlannerRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Create the run's planner, or restore it from the file."""
-        from plab.runners.contact_starts import ContactStarts
-
         number, problem = track.number, self.problem
         starts = ContactStarts(problem.scenes[number], problem.target_mass[number])
         planner = self._planners[number] = make_planner(track.cfg.method, starts, self._device)
