@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from plab.config import Config, build_scene
 from plab.demonstrations.carrying import carry
+from plab.plugins import pandas as pd
 from plab.targets import demonstration
 
 __all__ = ["known_actions", "load_actions"]

@@ -16,6 +16,7 @@ import numpy as np
 
 from plab.config import Config, ConfigError, ranges
 from plab.config.families import Appearance, Family, Rule
+from plab.demonstrations.minari import read_episodes
 from plab.plugins import torch
 from plab.runners.policy import PolicyConfig, Spaces, set_rate
 from plab.runners.training import ActorRunner
@@ -105,8 +106,6 @@ def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         plab.config.ConfigError: If observations or actions do not fit the spaces.
     """
-    from plab.demonstrations.minari import read_episodes
-
     seen, wanted = [], []
     for episode in read_episodes(method.dataset, method.demonstrations):
         observations: Any = episode.observations

@@ -20,9 +20,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import Appearance, Family
+from plab.demonstrations.minari import metadata_of, read_episodes
 from plab.runners.runner import Runner, Step, Track, shared_problem
 from plab.scenes import Camera, Scene, SceneError
 
@@ -79,8 +81,6 @@ class IdentifyRunner(Runner):
 
     def build(self) -> None:
         """Read the episode, and create an environment per perturbed parameter."""
-        from plab.demonstrations.minari import read_episodes
-
         (track,), method = self.tracks, self.method
         self.problem = shared_problem(self.cache, [track.cfg] * (2 * len(method.parameters) + 1))
         scene, episodes = self.problem.scenes[0], list(read_episodes(method.dataset, method.episode + 1))
@@ -111,9 +111,6 @@ class IdentifyRunner(Runner):
 
     def _read_depth(self, seen: Any) -> np.ndarray | None:
         """Return the mean depths of blocks after each step, shape [T, block]; None without these images."""
-        from gymnasium.spaces import Box
-
-        from plab.demonstrations.minari import metadata_of
         from plab.envs.observations import Sensors
 
         environment = json.loads(metadata_of(self.method.dataset).get("env_spec", "{}"))
