@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rl
 from plab.bench import speed, stability, unseen, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
 from toy_runner import COARSE_32
@@ -44,6 +45,13 @@ def test_speed_prints_and_writes_complete_rows(
     assert speed.main([*command, "--kinds", GRADIENT, FORWARD]) == 1
     assert [row["what"] for row in read(path)] == [FORWARD]
     assert f"not measured: {GRADIENT}, 2 environment(s): " in capsys.readouterr().err
+
+
+@pytest.mark.nightly
+def test_the_benchmark_of_learning_times_both_parts() -> None:
+    trainings = (2, 1, "ppo"), (1, 1, "sac")
+    for row in rl.rows([*COARSE_32, "task=Move", "sim.horizon=3"], trainings, 1):
+        assert row["simulate_ms"] > 0 and row["update_ms"] > 0
 
 
 def still(observation: np.ndarray) -> np.ndarray:
