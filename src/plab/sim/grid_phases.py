@@ -43,7 +43,8 @@ def with_friction(t, rn, friction):
 @ti.func
 def with_friction_adjoint(t, rn, friction, bar):
     length = t.norm()
-    t_bar = t * 0.0
+    # Without friction t is unchanged, including t = 0.
+    t_bar = ti.select(friction == 0.0, bar, t * 0.0)
     rn_bar = 0.0 * rn
     if length + rn * friction > 0.0 and length > 0.0:
         factor = 1.0 + rn * friction / length
