@@ -15,7 +15,9 @@ from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
 from plab.plugins import load_object
 from plab.runners import run_config
+from plab.runners.identify import IdentifyRunner, _value
 from plab.runners.policy import load_policy, policy_path
+from plab.scenes import Scene
 from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
 
@@ -148,7 +150,7 @@ def test_parameters_are_found_from_observations(tmp_path: Path, observation: str
         load_config([*words, *fit, "method.parameters=[mass]"])
 
 
-def test_a_fitted_poisson_ratio_is_possible(tmp_path: Path) -> None:
+def test_a_fitted_poisson_ratio_is_possible(tmp_path: Path, monkeypatch) -> None:
     words = ["task=Torus", *COARSE, f"results_dir={tmp_path}"]
     stuff = ["task.youngs_modulus=300", "task.poisson_ratio=0.45"]
     assert main([*words, "variant=1", *stuff, "--output", str(tmp_path)]) == 0
@@ -156,6 +158,26 @@ def test_a_fitted_poisson_ratio_is_possible(tmp_path: Path) -> None:
     rows = run(load_config([*words, *fit, "method.iterations=4", "task.youngs_modulus=180"])).iterations
     found = rows[["poisson_ratio", "poisson_ratio_deviation"]].to_numpy()[1:]
     assert np.isfinite(found).all() and 0.3 < found[:, 0].min() <= found[:, 0].max() <= 0.49
+
+    # Observations linear in the logarithms of four of five parameters, the last two with equal effect.
+    simulate, names = IdentifyRunner._simulate, ["yield_stress", "gravity", "poisson_ratio"]
+    names += ["youngs_modulus", "manipulator_friction"]
+
+    def linear(self: IdentifyRunner, scenes: list[Scene]) -> Any:
+        seen, measured = simulate(self, scenes)
+        noise, a, b, c = np.random.default_rng(0).normal(size=(4, *seen.shape[1:]))
+        effects = np.stack([0.0 * a, a, 1e-9 * b, c, c])
+        logs = np.log([[_value(scene, name) for name in names] for scene in scenes]) - np.log(truth)
+        return self._observed + 0.01 * noise + np.tensordot(logs, effects, 1), measured
+
+    truth = [50.0, 30.0, 0.2, 300.0, 0.9]
+    monkeypatch.setattr(IdentifyRunner, "_simulate", linear)
+    fit[-1] = f"method.parameters=[{','.join(names)}]"
+    last = run(load_config([*words, *fit, stuff[0], "method.iterations=4"])).iterations.iloc[-1]
+    relative = [last[f"{name}_deviation"] / last[name] for name in names]
+    expected = 0.01 / np.sqrt(50 * 3 * 5)
+    assert np.isnan(relative[0]) and relative[1:3] == pytest.approx([expected, 1e9 * expected], rel=0.1)
+    assert min(relative[3:]) > 1e3
 
 
 def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:

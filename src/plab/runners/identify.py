@@ -165,9 +165,12 @@ class IdentifyRunner(Runner):
             way *= 0.5
         state["trial"] = state["best"] + way
         variance = state["cost"] / max(residual.size - count, 1)
-        deviations = np.sqrt(variance * np.diag(np.linalg.pinv(state["curvature"])))
+        effects = np.sqrt(np.diag(state["curvature"]))
         # Parameters without effect, such as floor friction while bodies stick.
-        deviations[np.diag(state["curvature"]) == 0.0] = np.nan
+        effects[effects == 0.0] = np.nan
+        # Correlations, because effects differ by orders of magnitude; regularised for equal effects.
+        related = np.nan_to_num(state["curvature"] / np.outer(effects, effects)) + 1e-14 * np.eye(count)
+        deviations = np.sqrt(variance * np.diag(np.linalg.inv(related))) / effects
         found = dict.fromkeys(FAMILY.columns, np.nan)
         each = 1 if method.observation == "depth" else 3
         found["misfit"] = float(np.sqrt(each * state["cost"] / residual.size))
