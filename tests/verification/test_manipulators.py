@@ -466,6 +466,15 @@ def test_gradients_by_friction_and_gravity(touched: Simulator, contact: str) -> 
                 )
         assert all(slope for _, slope in ways.values())
         check_slopes(touched, ways)
+    # At friction 0 derivatives are one-sided, and equal to those at friction nearly 0.
+    lower = []
+    for friction in (0.0, 1e-9):
+        given = np.where(np.isin(np.arange(len(world)), (1, 2, 3)), world, friction)
+        touched.rollout(put(touched, [point._replace(world=given) for point in points]))
+        gradient = touched.world_gradient()
+        lower.append(np.column_stack([gradient["floor_friction"], gradient["friction"]]))
+    assert lower[0][len(TOUCHING), 0] != 0.0
+    np.testing.assert_allclose(*lower, rtol=1e-5, atol=1e-7 * np.abs(lower).max())
     # Without friction, a sphere that pushes along a row of nodes, which have no tangential velocity.
     smooth = Point(start(("Sphere",)), np.zeros_like(ACTIONS), world=np.zeros(len(world)))
     smooth.state.poses[0, 1:3], smooth.actions[:, 0] = (10 * SCENE.dx, 0.5), 0.9

@@ -333,12 +333,13 @@ class GridPhases(Storage):
         if floored:
             v2 = self.floor(v1, friction)
         out = self.wall_free(i, v2, bar, 2)
+        if ti.static(self.full_gradient):
+            # At friction 0, too, where the derivative is one-sided.
+            if v1[1] < 0.0 and friction < STICKING and i[1] - 1 < WALL:
+                slid, slid_bar = ti.Vector([v1[0], v1[2]]), ti.Vector([out[0], out[2]])
+                own = friction_adjoint(slid, v1[1], friction, slid_bar)
+                self.accumulate_world(grid_index, e, 0, own)
         if floored:
-            if ti.static(self.full_gradient):
-                if friction < STICKING:
-                    slid, slid_bar = ti.Vector([v1[0], v1[2]]), ti.Vector([out[0], out[2]])
-                    own = friction_adjoint(slid, v1[1], friction, slid_bar)
-                    self.accumulate_world(grid_index, e, 0, own)
             out = self.floor_adjoint(v1, friction, out)
         else:
             out = self.wall_free(i, v1, out, 1)
