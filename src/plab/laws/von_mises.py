@@ -131,7 +131,7 @@ VON_MISES = replace(
     name="von_mises",
     parameters=(
         *ELASTIC.parameters,
-        Parameter("yield_stress", 50.0, "[0, inf]", "Pa", "von Mises yield stress; inf never yields"),
+        Parameter("yield_stress", 50.0, "[0, inf]", "Pa", "norm of the deviator at yield; inf never yields"),
     ),
     update=update,
     coefficients=coefficients,
