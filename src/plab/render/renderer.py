@@ -22,10 +22,7 @@ BODY_COLORS = ("#d0694a", "#dda53f", "#8a9d5b", "#c67884", "#8e5f7d")
 """Colours of a scene's bodies, in order."""
 
 # Direction towards the light (right, up, to the camera), strength, colour. The first light casts the shadows.
-_LIGHTS = (
-    ((-0.35, 1.0, 0.25), 0.74, "#fff6ea"),
-    ((0.4, 0.4, 1.0), 0.48, "#eef2ff"),
-)
+_LIGHTS = (((-0.35, 1.0, 0.25), 0.74, "#fff6ea"), ((0.4, 0.4, 1.0), 0.48, "#eef2ff"))
 
 MANIPULATOR_COLOR = "#5a6470"
 TARGET_COLOR = "#2b8c9b"

@@ -166,9 +166,8 @@ class IdentifyRunner(Runner):
         state["trial"] = state["best"] + way
         variance = state["cost"] / max(residual.size - count, 1)
         effects = np.sqrt(np.diag(state["curvature"]))
-        # Parameters without effect, such as floor friction while bodies stick.
+        # Parameters may have no effect, such as floor friction while bodies stick, tiny or equal effects.
         effects[effects == 0.0] = np.nan
-        # Correlations, because effects differ by orders of magnitude; regularised for equal effects.
         related = np.nan_to_num(state["curvature"] / np.outer(effects, effects)) + 1e-14 * np.eye(count)
         deviations = np.sqrt(variance * np.diag(np.linalg.inv(related))) / effects
         found = dict.fromkeys(FAMILY.columns, np.nan)
@@ -176,8 +175,7 @@ class IdentifyRunner(Runner):
         found["misfit"] = float(np.sqrt(each * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
             found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
-        steps = len(self._actions) * len(scenes)
-        return Step(measured | found, self._actions, dict(state), steps_forward=steps)
+        return Step(measured | found, self._actions, dict(state), steps_forward=seen.shape[0] * seen.shape[1])
 
     def close(self) -> None:
         """Restore the configuration's scene."""
