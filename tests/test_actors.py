@@ -171,8 +171,7 @@ def test_rounds_take_the_drawn_scenes_in_turn() -> None:
         training.cycle()
         taken.append([one.seed_scene for one in batch.configs])
         sampled += [one.materials[0].yield_stress for one in batch.problem.scenes]
-    assert len(set(sampled)) == 9
-    assert taken == [[1000, 1001, 1002], [1003, 1004, 1000], [1001, 1002, 1003]]
+    assert len(set(sampled)) == 9 and taken == [[1000, 1001, 1002], [1003, 1004, 1000], [1001, 1002, 1003]]
     # Whoever shares the environments next has those it asks for.
     for variant in "1", "3":
         wanted = make_config(*words, f"variant={variant}")
@@ -252,5 +251,4 @@ def test_environments_that_break_off_teach_nothing(
     assert learned == ([4 * HORIZON] if len(broken) == 1 else [])
     after = list(training.network.parameters())
     assert all(parameter.isfinite().all() for parameter in after)
-    assert all(map(torch.equal, before, after)) == (len(broken) == 3)
-    assert training.episodes == 15
+    assert all(map(torch.equal, before, after)) == (len(broken) == 3) and training.episodes == 15

@@ -80,8 +80,7 @@ def test_a_variant_may_change_anything_and_add_bodies():
     box = "{shape: box, center: [0.5, 0.3, 0.2], size: [0.1, 0.1, 0.1], particles: 10}"
     changes = f"bodies={{second: {box}}}", "yield_stress=7", "bodies.rope.particles=20"
     scene = build_scene(load_config([f"+task.variants.1.{change}" for change in changes]))
-    assert scene.yield_stress == 7
-    assert [body.particles for body in scene.bodies] == [20, 10]
+    assert scene.yield_stress == 7 and [body.particles for body in scene.bodies] == [20, 10]
 
 
 def test_a_tilde_is_the_home(monkeypatch, tmp_path):

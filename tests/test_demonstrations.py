@@ -77,8 +77,7 @@ def test_recording_replaces_one_demonstration_and_keeps_the_rest(records):
     np.testing.assert_allclose(load_actions("Move", "3"), actions, atol=6e-5)
     assert np.array_equal(load_actions("Move", "2"), kept)
     table = pd.read_csv(records / "scores.csv", dtype={"variant": str})
-    assert len(table) == 50
-    assert table.set_index(["task", "variant"]).loc[("Move", "3"), "score"] == 0.5
+    assert len(table) == 50 and table.set_index(["task", "variant"]).loc[("Move", "3"), "score"] == 0.5
     before = (records / "Move.csv").read_text()
     save_actions("Move", "3", actions, names, 0.5)
     assert (records / "Move.csv").read_text() == before

@@ -112,8 +112,7 @@ def test_an_episode_is_that_of_the_simulator_and_the_objective(env: PlabEnv) -> 
         assert env.observation_space.contains(observed)
         terms = problem.simulator.losses()[0]
         assert [info["loss_density"], info["loss_sdf"], info["loss_contact"]] == list(terms)
-        assert info["loss"] == total_loss(terms, problem.weights)
-        assert reward == first["loss"] - info["loss"]
+        assert info["loss"] == total_loss(terms, problem.weights) and reward == first["loss"] - info["loss"]
     assert ends == [[False, False]] * (HORIZON - 1) + [[False, True]]
     final = problem.scores(problem.simulator.mass_tensor())[0]
     assert 0.01 < final.iou_final < final.iou_target_self

@@ -82,8 +82,7 @@ def test_make_names_the_versions_of_python_that_it_needs(tmp_path) -> None:
 
 
 def test_every_public_name_of_plab_is_there() -> None:
-    assert dir(plab) == sorted(plab.__all__)
-    assert all(getattr(plab, name) for name in plab.__all__)
+    assert dir(plab) == sorted(plab.__all__) and all(getattr(plab, name) for name in plab.__all__)
     assert plab.make.__module__ == "plab.envs" and len(plab.TASKS) == 10
     with pytest.raises(AttributeError, match="nothing"):
         _ = plab.nothing

@@ -82,13 +82,11 @@ def test_target_sdf_is_the_distance_to_the_nearest_target_node(rng):
 def test_soft_iou_is_its_formula(a, b):
     p, q, iou = a / a.max(), b / b.max(), soft_iou(a, b)
     assert iou == pytest.approx((p * q).sum() / (p + q - p * q).sum(), rel=1e-9, abs=1e-12)
-    assert 0 <= iou <= 1 + 1e-12
-    assert soft_iou(b, a) == pytest.approx(iou, rel=1e-12)
+    assert 0 <= iou <= 1 + 1e-12 and soft_iou(b, a) == pytest.approx(iou, rel=1e-12)
     assert soft_iou(3 * a, 0.5 * b) == pytest.approx(iou, rel=1e-9)
     binary = np.zeros((3, 3, 3))
     binary[1, 1, :] = 0.7
-    assert soft_iou(binary, binary) == 1.0
-    assert soft_iou(binary, np.roll(binary, 1, axis=0)) == 0.0
+    assert soft_iou(binary, binary) == 1.0 and soft_iou(binary, np.roll(binary, 1, axis=0)) == 0.0
 
 
 def test_scores_are_their_formulas(rng):
@@ -158,8 +156,7 @@ def test_scores_where_nothing_can_be_gained_and_beyond_the_target():
     full[1] = 1.0
     stayed, left = scores(full, full, full), scores(full, np.roll(full, 1, axis=0), full)
     assert (stayed.score, stayed.score_printed, left.score, left.score_printed) == (1.0, 1.0, 0.0, 0.0)
-    assert scores_from_iou(0.5, 0.45, 0.4).score == 1.0
-    assert scores_from_iou(0.5, 0.35, 0.4).score == 0.0
+    assert scores_from_iou(0.5, 0.45, 0.4).score == 1.0 and scores_from_iou(0.5, 0.35, 0.4).score == 0.0
     np.testing.assert_array_equal(batch_scores(score_scale([0.2], [0.5]), np.array([0.6]))[0], [1.0])
 
 
@@ -167,8 +164,7 @@ def test_mass_at_a_wall_is_smoothed_into_the_void():
     start, target = np.zeros((2, 32, 32, 32))
     start[0, 0, 0] = target[16, 16, 16] = 1.0
     change = mass_change(start, target)
-    assert change.clip(0.0).sum() == pytest.approx(1.0, abs=1e-3)
-    assert (-change).clip(0.0).sum() < 0.5
+    assert change.clip(0.0).sum() == pytest.approx(1.0, abs=1e-3) and (-change).clip(0.0).sum() < 0.5
 
 
 def test_distances_of_shapes_are_the_way_between_them():

@@ -144,8 +144,7 @@ def test_boxes_with_cavities_apart_and_turned_inwards():
     assert mesh.volume == pytest.approx(7 / 8)
     assert (np.abs(mesh.fill(3000, rng.random)).max(axis=1) > 0.25).all()
     mesh = load_mesh(write(two(BOX + np.array([2, 0, 0]))))
-    assert mesh.volume == pytest.approx(2 / 27)
-    assert (np.abs(mesh.fill(3000, rng.random)[:, 0]) > 1 / 6).all()
+    assert mesh.volume == pytest.approx(2 / 27) and (np.abs(mesh.fill(3000, rng.random)[:, 0]) > 1 / 6).all()
     assert load_mesh(write(obj(BOX, INSIDE_OUT))).inside(np.zeros((1, 3))).all()
 
 
@@ -253,8 +252,7 @@ def test_a_changed_file_is_another_configuration_and_a_moved_one_is_not(tmp_path
     assert stored["variants"]["1"]["target"]["bodies"]["star"]["sha256"] == digest
     (tmp_path / "star.obj").unlink()
     moved = example(f"task.bodies.star.sha256={digest}")
-    assert moved.task.bodies["star"].file == str(EXAMPLE / "star.obj")
-    assert moved.hash == first.hash
+    assert moved.task.bodies["star"].file == str(EXAMPLE / "star.obj") and moved.hash == first.hash
     (tmp_path / "star.obj").write_text(obj(BOX))
     assert example().hash != first.hash
     for refusal, build in (

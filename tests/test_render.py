@@ -117,8 +117,7 @@ def test_a_fitted_camera_sees_all_points_and_little_else(view):
 def test_the_camera_of_a_scene_sees_manipulators_and_target():
     camera = dataclasses.replace(scene_camera(scene(SPHERE), box_mass(GHOST), SIZE), size=SIZE)
     seen = camera.project(np.array([SPHERE.position, GHOST, CUBE.center]))
-    assert np.all((seen > 0) & (seen < SIZE))
-    assert set(suite_tasks()) == set(VIEWS)
+    assert np.all((seen > 0) & (seen < SIZE)) and set(suite_tasks()) == set(VIEWS)
     assert math.isfinite(sum(scene_camera(dataclasses.replace(scene(SPHERE), name="Own")).position))
 
 
@@ -164,8 +163,7 @@ def is_metal(rgb: np.ndarray) -> bool:
 def test_bodies_and_manipulators_are_drawn_where_they_are_with_their_shadows(pictures):
     frame = pictures["all"]
     assert frame.shape == (SIZE[1], SIZE[0], 3) and frame.dtype == np.uint8
-    assert np.array_equal(frame, pictures["all again"])
-    assert is_clay(color(pictures, "all", CUBE.center))
+    assert np.array_equal(frame, pictures["all again"]) and is_clay(color(pictures, "all", CUBE.center))
     assert not is_clay(color(pictures, "moved", CUBE.center + np.array([0.0, 0.0, 0.1])))
     assert is_clay(color(pictures, "moved", CUBE.center + np.array([0.0, 0.0, -0.25])))
     assert is_metal(color(pictures, "all", SPHERE.position))
@@ -183,8 +181,7 @@ def test_the_target_is_a_ghost_that_vanishes_where_it_is_reached_or_drawn_alone(
     assert apart["all"][:, :10].mean() < 0.3 and apart["reached"].mean() < 1.0
 
     alone = color(pictures, "target", GHOST)
-    assert alone[2] > 2 * alone[0]
-    assert not is_clay(color(pictures, "target", CUBE.center))
+    assert alone[2] > 2 * alone[0] and not is_clay(color(pictures, "target", CUBE.center))
     assert not is_metal(color(pictures, "target", SPHERE.position))
 
 
@@ -197,8 +194,7 @@ def recording():
 
 
 def test_a_recording_holds_the_start_and_every_step(recording):
-    assert recording.x.shape == (4, recording.scene.particle_count, 3)
-    assert recording.poses.shape == (4, 3, 8)
+    assert recording.x.shape == (4, recording.scene.particle_count, 3) and recording.poses.shape == (4, 3, 8)
     assert recording.poses[:, 0, 0] - recording.poses[0, 0, 0] == pytest.approx(0.5 * 0.01 * np.arange(4))
     scores = recording.scores
     assert scores.shape == (4,) and scores[0] == 0 and recording.score == scores[3]
@@ -211,8 +207,7 @@ def test_films_as_gif_and_mp4(recording):
         assert (film.size, film.n_frames, film.info["duration"]) == (SIZE, 3, 100)
         first = np.asarray(film.convert("RGB"), int)
         film.seek(2)
-        assert np.abs(np.asarray(film.convert("RGB")) - first).max() > 50
-        assert film.info["duration"] == 1000
+        assert np.abs(np.asarray(film.convert("RGB")) - first).max() > 50 and film.info["duration"] == 1000
 
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     save(recording, Path("film.mp4"), SIZE)
@@ -220,8 +215,7 @@ def test_films_as_gif_and_mp4(recording):
     meta = next(reader)
     frames = [np.frombuffer(frame, np.uint8) for frame in reader]
     # The last one is held for a second.
-    assert (tuple(meta["size"]), meta["fps"], len(frames)) == (SIZE, 20.0, 4 + 19)
-    assert frames[0].std() > 10
+    assert (tuple(meta["size"]), meta["fps"], len(frames)) == (SIZE, 20.0, 4 + 19) and frames[0].std() > 10
 
 
 def test_runs_of_a_task_share_a_simulator():
@@ -232,8 +226,7 @@ def test_runs_of_a_task_share_a_simulator():
         wanted[Path(f"Rope-v{cfg.variant}")] = Path(cfg.variant, "run.h5"), False
     cache, made = SimulatorCache(), []
     draw_runs(wanted, lambda: None, lambda cfg: made.append(shared_problem(cache, [cfg])) or made[-1])
-    assert len(list(Path.cwd().glob("Rope-v[12]/*.webp"))) == 6
-    assert made[0].simulator is made[1].simulator
+    assert len(list(Path.cwd().glob("Rope-v[12]/*.webp"))) == 6 and made[0].simulator is made[1].simulator
     np.testing.assert_array_equal(record(cfg, run.best_actions, made[1]).x, record(cfg, run.best_actions).x)
 
 
@@ -310,8 +303,7 @@ def test_depth_and_labels_agree_with_pictures_to_a_pixel(position):
             renderer._plotter.render()
             known = -renderer._plotter.get_image_depth()
             mine, there = labels == label, np.isfinite(known)
-            assert there.sum() > 60
-            assert not (mine & ~binary_dilation(there, np.ones((3, 3)))).any()
+            assert there.sum() > 60 and not (mine & ~binary_dilation(there, np.ones((3, 3)))).any()
             assert not (there & ~binary_dilation(mine, np.ones((3, 3)))).any()
             inner = binary_erosion(mine & there, np.ones((5, 5)))
             assert np.abs(depth - known)[inner].max() < (0.005 if label == 2 else 0.035)

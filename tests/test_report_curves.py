@@ -46,8 +46,7 @@ def test_values_below_zero_count_as_zero_run_by_run() -> None:
     assert band(runs, "episodes", "reward", floor=None)[1].tolist() == [-4.0, 1.0]
     # No runs and runs apart give no band.
     later = runs[0].assign(episodes=[8, 9])
-    assert band([], "episodes", "reward") is None
-    assert band([runs[0], later], "episodes", "reward") is None
+    assert band([], "episodes", "reward") is None and band([runs[0], later], "episodes", "reward") is None
 
 
 def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
@@ -64,8 +63,7 @@ def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
     for family in ("planner", "own:FAMILY"):
         assert table(family)["best_score"].tolist() == [0.4, 0.4, 0.6, 0.6]
     spent = table("planner")
-    assert spent["simulated"].tolist() == [10, 25, 35, 50]
-    assert spent["substeps"].tolist() == [20, 50, 70, 100]
+    assert spent["simulated"].tolist() == [10, 25, 35, 50] and spent["substeps"].tolist() == [20, 50, 70, 100]
     found = statistics.scores_at(spent, np.array([9.0, 10.0, 34.0, 35.0, 1e6]))
     np.testing.assert_array_equal(found, [np.nan, 0.4, 0.4, 0.6, 0.6])
 
@@ -104,8 +102,7 @@ def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
     strata = [np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.4, 0.5, 0.6, 9.0])]
     found = interquartile_mean(strata)
     assert found.value == pytest.approx(np.mean([0.2, 0.3, 0.4, 0.5]))
-    assert found.low <= found.value <= found.high
-    assert interquartile_mean(strata) == found
+    assert found.low <= found.value <= found.high and interquartile_mean(strata) == found
     # No spread within configurations, however different they are: nothing is uncertain.
     found = interquartile_mean([np.full(3, value) for value in (0.0, 0.2, 0.7, 1.0)])
     assert found.low == found.value == found.high

@@ -120,8 +120,7 @@ def test_differences_and_rows_per_configuration(folder: Path) -> None:
     data = by_form(iou_tables(gather(folder), "task"))["comparison"].data.set_index(["task", "method"])
     # Over the variants that both have; the paper's PPO on Move: 0.72 and 0.60 in variants 1 and 2.
     row = data.loc[("Move", "ppo")]
-    assert row["difference"] == pytest.approx((0.4 - 0.72 + 0.5 - 0.60) / 2)
-    assert np.isnan(row["low"])
+    assert row["difference"] == pytest.approx((0.4 - 0.72 + 0.5 - 0.60) / 2) and np.isnan(row["low"])
     row = data.loc[("Rope", "adam")]
     assert row["low"] < row["difference"] < row["high"]
     assert row["difference"] == pytest.approx(row["mean"] - np.mean([0.66, 0.71, 0.52, 0.37, 0.70]))
@@ -162,8 +161,7 @@ def test_mixed_settings_are_refused_with_advice(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"Rope.* adam .*sim\.particles_scale=0\.25"):
         gather(tmp_path)
     runs = gather(tmp_path, f"{key}=0.5")
-    assert len(runs.table) == 1
-    assert runs.unusual == [f"method.iterations = {synthetic.ROWS}", f"{key} = 0.5"]
+    assert len(runs.table) == 1 and runs.unusual == [f"method.iterations = {synthetic.ROWS}", f"{key} = 0.5"]
     assert f"{key} = 0.5" in by_form(iou_tables(runs, "task"))["ours"].notes[-1]
     # Two runs of one seed.
     save(tmp_path, {key: 0.5, "sim.device": "cuda"}, seed=1)

@@ -108,8 +108,7 @@ def test_changed_new_and_removed_files_are_noticed(folder: Path, opened: list[st
     new = synthetic.save(synthetic.run(folder, seed=7))
     opened.clear()
     table = load(folder).set_index("seed")
-    assert sorted(opened) == sorted([replaced.name, new.name])
-    assert list(table.index) == [0, 2, 7]
+    assert sorted(opened) == sorted([replaced.name, new.name]) and list(table.index) == [0, 2, 7]
     assert table.loc[0, "score"] == pytest.approx(0.25)
     assert ask(folder, "SELECT seed FROM runs ORDER BY seed") == [(0,), (2,), (7,)]
     curves, unchanged = read_curves([replaced, kept])

@@ -136,8 +136,7 @@ def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
     np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-6)
     judged = scores(result.masses["initial"], result.masses["final"], result.masses["target"])
     assert result.evaluation["score"] == judged.score and judged.iou_final > 0.1
-    assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"}
-    assert result.resume is None
+    assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"} and result.resume is None
     # The best actions are those of the best evaluation.
     best = int(rows["loss"].argmin())
     assert result.best_iteration == best and result.best_loss == rows["loss"][best]
@@ -397,8 +396,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
 def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
     """Halve until the buffers fit ``sim.memory_mb``; a single buffer is always tried."""
     cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
-    assert statuses(cfgs) == ["finished"] * 2
-    assert {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
+    assert statuses(cfgs) == ["finished"] * 2 and {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
 
 
 # ---------------------------------------------------------------- CUDA

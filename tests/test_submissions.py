@@ -315,8 +315,7 @@ def test_scores_are_means_of_whole_tables_within_budgets(leaders) -> None:
     assert plans["tasks"][suite_tasks().index("Move")] == pytest.approx(1.2 / 5)
     assert plans["tasks"][suite_tasks().index("Rope")] is None
     policy = lines["policy"]
-    assert policy["status"] == "claimed"
-    assert policy["budgets"] == [None, None, None, pytest.approx(0.6 / 50)]
+    assert policy["status"] == "claimed" and policy["budgets"] == [None, None, None, pytest.approx(0.6 / 50)]
     unseen = sections["Unseen configurations"]
     assert (unseen["lines"][0]["score"], unseen["expected"]) == (pytest.approx(0.6 / 100), 100)
 
