@@ -176,8 +176,7 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(
     cfgs = [load_config([*words, f"seed={seed}"], folder) for seed in range(4)]
     with pytest.raises(ConfigError, match=r"method\.optimizer 'adam' .*signs"):
         load_config([*words, "method.optimizer=adam"], folder)
-    assert plan(cfgs) == [cfgs]
-    assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
+    assert plan(cfgs) == [cfgs] and [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
     for result in (read(cfg.path) for cfg in cfgs):
         assert result.provenance["batch"] == 4 and np.ptp(result.iterations["loss"]) > 0
     assert [found for _, found in check(folder)] == [""] * 4

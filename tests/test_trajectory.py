@@ -106,8 +106,7 @@ def test_file_holds_the_whole_run(finished: RunResult) -> None:
     # After the last, two sequences are tried in the hard contact model.
     assert rows["steps_gradient"].tolist() == [3, 6, 9, 12] and rows["steps_forward"].tolist() == [0, 0, 0, 6]
     judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
-    assert finished.evaluation["score"] == judged.score
-    assert finished.evaluation["iou"] == judged.iou_final
+    assert finished.evaluation["score"] == judged.score and finished.evaluation["iou"] == judged.iou_final
     assert set(finished.wall_time) == {"build", "compile", "optimise", "evaluate"}
     assert finished.provenance["precision"] == "float64" and finished.provenance["resumed"] == 0
     assert finished.resume is None
@@ -162,8 +161,7 @@ def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypa
     simulator = shared_problem(CACHE, [cfg]).simulator
     assert simulator.scenes[0] == build_scene(cfg) != build_scene(other)
     assert run(other).iterations["loss"][0] != finished.iterations["loss"][0]
-    assert shared_problem(CACHE, [other]).simulator is simulator
-    assert simulator.scenes[0] == build_scene(other)
+    assert shared_problem(CACHE, [other]).simulator is simulator and simulator.scenes[0] == build_scene(other)
     assert_same_numbers(run(replace(cfg, force=True)), finished)
     assert finished.path.stat().st_mtime_ns > before
 
@@ -200,8 +198,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
     assert (left.status, left.message, len(left.iterations)) == (status, message, min(at, ITERATIONS))
     resumed = run(cfg)
     assert_same_numbers(resumed, finished)
-    assert resumed.provenance["resumed"] == 1
-    assert not cfg.path.with_suffix(".partial.h5").exists()
+    assert resumed.provenance["resumed"] == 1 and not cfg.path.with_suffix(".partial.h5").exists()
 
 
 @pytest.mark.parametrize(("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)])
@@ -288,8 +285,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
 
 def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_path: Path) -> None:
     rows, cfg = trained.iterations, make_config(tmp_path, *APG)
-    assert rows["steps"].tolist() == [3 * i for i in range(ITERATIONS)]
-    assert not rows["steps_forward"].any()
+    assert rows["steps"].tolist() == [3 * i for i in range(ITERATIONS)] and not rows["steps_forward"].any()
     assert rows["steps_gradient"].tolist() == [3 * (i + 1) for i in range(ITERATIONS)]
     (batch,) = shared_batches(CACHE, ([cfg], cfg.method.contact))
     torch.manual_seed(cfg.seed)
@@ -307,7 +303,6 @@ def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_pa
         assert row["loss_sdf"] == pytest.approx(float(done.terms[:, 0, 1].sum()), rel=1e-6)
         assert row["gradient_norm"] == pytest.approx(float(norm), rel=1e-6)
         adam.step()
-    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0]
-    assert trained.best_loss == rows["loss"].min()
+    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and trained.best_loss == rows["loss"].min()
     judged = scores(trained.masses["initial"], trained.masses["final"], trained.masses["target"])
     assert trained.evaluation["score"] == judged.score
