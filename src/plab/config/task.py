@@ -38,7 +38,7 @@ class BodyConfig(ranges.Section):
         sha256: Mesh only: SHA-256 of the file. Default: computed; another checksum is rejected.
         youngs_modulus: Young's modulus E; default: the task's, as for the following keys.
         poisson_ratio: Poisson ratio nu.
-        yield_stress: von Mises yield stress; ``inf`` never yields.
+        yield_stress: Norm of the stress deviator at yield; ``inf`` never yields.
         law: Constitutive law: a key of :data:`plab.scenes.LAWS`, or the ``module:NAME`` of a custom law;
             default: ``von_mises``.
         parameters: Other parameters of the law, by name; default: the law's.
@@ -235,7 +235,7 @@ class TaskConfig(ranges.Section):
         name: Name of the task in results and reports.
         youngs_modulus: Young's modulus E; the density is 1.
         poisson_ratio: Poisson ratio nu.
-        yield_stress: von Mises yield stress; ``inf`` never yields.
+        yield_stress: Norm of the stress deviator at yield; ``inf`` never yields.
         floor_friction: Friction of the floor: 0 slips, 10 or more sticks.
         gravity: Acceleration (x, y, z).
         bodies: Plasticine bodies, by name.
