@@ -83,17 +83,18 @@ def test_every_autoreset_mode_is_that_of_gymnasium(vector, alone) -> None:
 def test_a_diverged_environment_is_truncated_and_the_others_go_on(vector, alone) -> None:
     mode, actions = vector.metadata["autoreset_mode"], np.full((2, 6), 0.5)
     vector.reset()
-    make_not_finite(vector.batch.problem.simulator, 0)
-    observation, _, terminated, truncated, info = vector.step(actions)
-    assert truncated.tolist() == [True, False] and not terminated.any() and np.isfinite(observation).all()
-    reasons = info["final_info"]["failure"] if mode == AutoresetMode.SAME_STEP else info["failure"]
-    assert "not finite" in reasons[0] and reasons[1] is None
-    if mode == AutoresetMode.DISABLED:
-        with pytest.raises(ResetNeeded):
-            vector.step(actions)
-        return
+    for e in range(2):  # with NextStep, the first one is reset in the step in which the second one diverges
+        make_not_finite(vector.batch.problem.simulator, e)
+        observation, _, terminated, truncated, info = vector.step(actions)
+        assert truncated.nonzero()[0] == [e] and not terminated.any() and np.isfinite(observation).all()
+        reasons = info["final_info"]["failure"] if mode == AutoresetMode.SAME_STEP else info["failure"]
+        assert "not finite" in reasons[e] and reasons[1 - e] is None
+        if mode == AutoresetMode.DISABLED:
+            with pytest.raises(ResetNeeded):
+                vector.step(actions)
+            return
     ends = [vector.step(actions)[3].tolist() for _ in range(HORIZON)]
-    assert [end[1] for end in ends][:2] == [False, True] and not ends[0][0]
+    assert [end[0] for end in ends].index(True) == 1 + (mode == AutoresetMode.NEXT_STEP) and not ends[0][1]
     env = PlabVecEnv(vector.batch)
     env.reset()
     make_not_finite(vector.batch.problem.simulator, 1)
@@ -121,7 +122,7 @@ def test_stages_ask_for_one_target_after_the_other() -> None:
     """The first target is next to the ball; the second environment reaches it in one step."""
     near = "{recipe: bodies, bodies: {ball: {shape: sphere, center: [0.68, 0.56, 0.75], size: [0.1]}}}"
     overrides = [*COARSE, "sim.horizon=4"]
-    options = {"autoreset_mode": "Disabled", "success_score": 0.02, "observe": ["state", "target_mass"]}
+    options = {"success_score": 0.02, "observe": ["state", "target_mass"]}
     staged = [*overrides, f"+task.stages=[{near}]"]
     env = plab.make_vec("Move", num_envs=2, overrides=staged, **options)
     plain = plab.make_vec("Move", num_envs=2, overrides=overrides, **options)
@@ -138,8 +139,10 @@ def test_stages_ask_for_one_target_after_the_other() -> None:
     assert rewards[1] > 0.0 and steps[1][1][1] == pytest.approx(rewards[1] + gained, rel=1e-6)
     kept = env.get_state()
     third = env.step(actions)
-    env.reset(options={"reset_mask": np.array([False, True])})
-    assert env.step(actions)[4]["stage"].tolist() == [0, 1]
+    for _ in range(2):  # the first one goes on, then is reset
+        env.reset(options={"reset_mask": np.array([False, True])})
+        repeated = env.step(actions)[4]
+        assert repeated["stage"].tolist() == [0, 1] and repeated["loss"][1] == info["loss"][1]
     env.set_state(kept)
     assert data_equivalence(env.step(actions), third, exact=True)
     again, info = env.reset()

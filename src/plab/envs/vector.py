@@ -55,11 +55,9 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
-        self.render_mode = check_render_mode(render_mode)
-        self._mode = AutoresetMode(autoreset_mode)
+        self.render_mode, self._mode = check_render_mode(render_mode), AutoresetMode(autoreset_mode)
         self.metadata = METADATA | {"autoreset_mode": self._mode}  # type: ignore[misc]
-        self.batch = make_batch(task, variant, num_envs=num_envs, **options)
-        self.num_envs = num_envs
+        self.batch, self.num_envs = make_batch(task, variant, num_envs=num_envs, **options), num_envs
         self.single_observation_space = self.batch.observation_space
         self.single_action_space = self.batch.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -103,10 +101,11 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         done = self.batch.step(np.asarray(actions), strict=False, idle=idle)
         observation, reward = done.observation, np.where(idle, 0.0, done.reward)
         terminated, truncated = done.terminated & ~idle, done.cut_off & ~idle
-        info = self._masked(done.info, done.failures)
+        info = done.info
         if idle.any():
-            observation, info = self._restarted(idle)
-        over = terminated | truncated
+            observation, first = self.batch.reset(environments=np.flatnonzero(idle))
+            info = _mixed(info, first, idle)
+        info, over = self._masked(info), terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and over.any():
             ended: dict[str, Any] = {}
             for e in np.flatnonzero(over).tolist():
@@ -120,7 +119,7 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Restore a state from :meth:`get_state`; return its observations and ``info``."""
         observation, info = self.batch.set_state(state)
-        return observation, self._masked(info, self.batch.failures)
+        return observation, self._masked(info)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the simulator."""
@@ -129,14 +128,21 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     def _restarted(self, mask: np.ndarray, **how: Any) -> tuple[Any, dict[str, Any]]:
         """Start the next episodes of some sub-environments; return observations and ``info`` of all."""
         observation, info = self.batch.reset(environments=None if mask.all() else np.flatnonzero(mask), **how)
-        return observation, self._masked(info, {})
+        return observation, self._masked(info)
 
-    def _masked(self, info: Mapping[str, Any], failures: Mapping[int, str]) -> dict[str, Any]:
+    def _masked(self, info: Mapping[str, Any], nested: bool = False) -> dict[str, Any]:
         """Add Gymnasium's masks of the sub-environments that have an entry, and the reasons of failures."""
         out: dict[str, Any] = {}
         for name, values in info.items():
-            own = self._masked(values, {}) if isinstance(values, Mapping) else values
+            own = self._masked(values, True) if isinstance(values, Mapping) else values
             out |= {name: own, f"_{name}": np.ones(self.num_envs, bool)}
-        for e, reason in failures.items():
+        for e, reason in ({} if nested else self.batch.failures).items():
             out = self._add_info(out, {"failure": reason}, e)
         return out
+
+
+def _mixed(old: Any, new: Any, rows: np.ndarray) -> Any:
+    """Return ``info`` of the new episodes in some sub-environments, of the last step in the others."""
+    if isinstance(new, Mapping):
+        return {name: _mixed(old[name], own, rows) for name, own in new.items()}
+    return np.where(rows.reshape(-1, *[1] * (new.ndim - 1)), new, old)
