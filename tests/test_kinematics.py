@@ -19,7 +19,7 @@ from plab.config import ConfigError, build_scene, load_config
 from plab.config.run import config_dict, config_hash
 from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS
 from plab.demonstrations import known_actions
-from plab.kinematics import Chain, read_model
+from plab.kinematics import Chain, Joint, Link, read_model
 from plab.kinematics.actions import JointActions
 from plab.losses import make_terms
 from plab.problem import Problem
@@ -67,6 +67,11 @@ def test_a_scene_has_31_manipulators_at_most() -> None:
     small(*[ball] * 31).validate()
     with pytest.raises(SceneError, match="32 manipulators are more than 31"):
         small(*[ball] * 32).validate()
+    # Folded out, an elbow beside the origin moves the tip away by twice its distance.
+    eye, axis = tuple(map(tuple, np.eye(4))), (0.0, 0.0, 1.0)
+    joints = Joint("a", -1, eye, True, axis, scale=1.0), Joint("b", 0, eye, True, axis, (0.4, 0.0, 0.0))
+    chain = Chain(joints, (Link(1, eye, "SphereLink", (0.05,)),))
+    assert chain.largest_step() >= np.linalg.norm(chain.frames([0.0, np.pi])[0, :3, 3])
 
 
 # ---------------------------------------------------------------------------------------- articulated models

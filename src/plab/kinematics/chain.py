@@ -137,9 +137,10 @@ class Chain:
             way, number = 0.0, link.parent
             while number >= 0:
                 joint = self.joints[number]
-                way += joint.scale * ((reach + float(np.linalg.norm(joint.anchor))) if joint.hinge else 1.0)
-                slide = 0.0 if joint.hinge else max(abs(joint.low), abs(joint.high))
-                reach += float(np.linalg.norm(np.array(joint.offset)[:3, 3])) + min(slide, 1.0)
+                arm = float(np.linalg.norm(joint.anchor))
+                way += joint.scale * (reach + arm if joint.hinge else 1.0)
+                moved = 2.0 * arm if joint.hinge else min(max(abs(joint.low), abs(joint.high)), 1.0)
+                reach += float(np.linalg.norm(np.array(joint.offset)[:3, 3])) + moved
                 number = joint.parent
             most = max(most, way)
         return most
@@ -171,15 +172,13 @@ class Chain:
             ModelError: If a pattern matches no joint, limits are not in order, an initial position is outside
                 them, or no joint can move.
         """
-        turn = pose_matrix((0.0, 0.0, 0.0), rotation)
-        place = pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
+        turn, place = pose_matrix((0.0, 0.0, 0.0), rotation), pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
         base: list[Joint] = []
         for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ()):
             most = math.pi if k >= 3 else 1.0
             offset = _tuples(np.eye(4) if k else place)
             base.append(Joint(name, k - 1, offset, k >= 3, axis, low=-most, high=most))
-        first = turn if base else place @ turn
-        shift = len(base)
+        first, shift = turn if base else place @ turn, len(base)
 
         def moved(node: Node) -> Node:
             if node.parent >= 0:
