@@ -131,6 +131,11 @@ def test_a_torus_is_as_its_formula_in_all_formats(tmp_path):
     assert np.hypot(x, y).mean() == pytest.approx(1 + 0.09 / 4, abs=6e-3)
     np.testing.assert_allclose([x.mean(), y.mean(), z.mean()], 0, atol=0.03)
     assert mesh.volume * 2.6**3 == pytest.approx(2 * np.pi**2 * 0.09, rel=2e-3)
+    # On vertical lines through vertices, too.
+    trimesh.creation.icosphere(1).export(tmp_path / "ball.obj")
+    ball = load_mesh("ball.obj")
+    tops = ball.vertices[ball.vertices[:, 1] > 0.4]
+    assert [ball.inside(tops * [1, y, 1]).mean() for y in (-2.0, -0.5, 0.5, 2.0)] == [0.0, 1.0, 1.0, 0.0]
 
 
 def test_boxes_with_cavities_apart_and_turned_inwards():

@@ -84,8 +84,7 @@ class Mesh:
         """Read and check a mesh; see :func:`load_mesh` for arguments and errors."""
         if Path(file).suffix.lower() not in MESHES:
             raise ShapeError(f"{file} is not a mesh file: use {', '.join(MESHES)}")
-        self.sha256 = sha256
-        surface = read_mesh(file, force="mesh")
+        self.sha256, surface = sha256, read_mesh(file, force="mesh")
         faces = np.asarray(getattr(surface, "faces", []))
         if not len(faces):
             raise ShapeError(f"{file} has no faces")
@@ -157,13 +156,14 @@ class Mesh:
         for k in range(3):
             a, b = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
             turned = a > b
-            # Neighbouring triangles compute the same values for a shared edge, so that no line passes between
-            # them.
+            # Neighbouring triangles compute the same values for a shared edge, and lines through edges and
+            # vertices are shifted by infinitesimals, along x more than along z, so that none is lost.
             from_, to = flat[np.where(turned, b, a)], flat[np.where(turned, a, b)]
             edge, way = to - from_, at - from_
             cross = edge[:, 0] * way[:, 1] - edge[:, 1] * way[:, 0]
             area[k] = np.where(turned, -cross, cross)
-            left[k] = (cross >= 0) ^ turned
+            side = np.where(edge[:, 1] == 0.0, edge[:, 0], -edge[:, 1])
+            left[k] = (np.where(cross == 0.0, side, cross) > 0.0) ^ turned
         down = np.asarray(left.all(axis=0))
         met = down | ~np.asarray(left.any(axis=0))
         area = area[:, met]
