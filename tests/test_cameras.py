@@ -88,7 +88,8 @@ EVERYTHING = {
 
 def test_environments_observe_by_key():
     env = plab.make("Move", overrides=COARSE, **EVERYTHING)
-    many = plab.make_vec("Move", num_envs=2, overrides=COARSE, **EVERYTHING)
+    own = {"overrides_per_env": [["variant=2"], []]}
+    many = plab.make_vec("Move", num_envs=2, overrides=COARSE, **EVERYTHING, **own)
     one, _info = env.reset(seed=0)
     both, _infos = many.reset(seed=0)
     assert one in env.observation_space and both in many.observation_space
@@ -113,6 +114,12 @@ def test_environments_observe_by_key():
         np.testing.assert_array_equal(values, last[key])
     env.close()
     many.close()
+    # Points are of all bodies, and not seen by a camera that cuts them off.
+    near = {"top": EVERYTHING["cameras"]["top"] | {"near": 2.1}}
+    env = plab.make("TripleMove", overrides=COARSE, observe="points", cameras=near)
+    points, bodies = env.reset()[0], env.unwrapped.batch.problem.scenes[0].bodies
+    gaps = np.linalg.norm(points[:, None, :3] - [body.center for body in bodies], axis=-1)
+    assert not points[:, 3].any() and np.bincount(gaps.argmin(axis=1)).min() > 50
     assert plab.make("Move", overrides=COARSE, observe="depth").reset()[0].shape == (64, 64, 1)
     camera = "+task.cameras.low={position: [0.5,0.9,1.7], target: [0.5,0.2,0.5], size: [32,24], far: 5}"
     low, options = [*COARSE, camera], {"observe": ["depth", "rgb", "segmentation", "points"]}

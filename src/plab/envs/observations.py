@@ -45,8 +45,18 @@ class SurfacePoints:
     def __init__(self, simulator: Simulator, count: int, cameras: Sequence[CameraSensor]) -> None:
         """Initialise with the observed simulator, the number of points, and cameras."""
         self._simulator, self._count, self._cameras = simulator, count, cameras
-        body = simulator.scenes[0].bodies[0]
-        self._spacing = (body.volume / body.particles) ** (1 / 3)
+        self._known: tuple[Any, ...] = ((),)
+
+    def _of_scenes(self, like: Any) -> list[Any]:
+        """Return the mean particle spacing in each environment's sparsest body, shape [batch, 1], and each
+        particle's number in its body divided by the body's number of particles, shape [batch, particle]."""
+        import torch
+
+        if self._known[0] is not (scenes := self._simulator.scenes):
+            sparsest = [max((b.volume / b.particles) ** (1 / 3) for b in scene.bodies) for scene in scenes]
+            ranks = [np.concatenate([np.arange(n := b.particles) / n for b in s.bodies]) for s in scenes]
+            self._known = scenes, min(sparsest), Constants(np.array(sparsest)[:, None]), Constants(ranks)
+        return [torch.as_tensor(values.like(like)).to(like) for values in self._known[2:]]
 
     def __call__(self, like: Array) -> Array:
         """Return points of the current states, shape [batch, point, 3], float32. With cameras, a fourth entry
@@ -55,9 +65,10 @@ class SurfacePoints:
         import torch
 
         x = torch.as_tensor(self._simulator.observe(1, like)[..., :3]).float()
-        edge = self.CELL * self._spacing
-        nodes = int(1.0 / edge) + 4
-        cell = (x / edge).floor().long().clamp(-1, nodes - 3) + 1
+        spacing, ranks = self._of_scenes(x)
+        # The finest grid determines the number of nodes, on the host, so that nothing waits for the device.
+        nodes = int(1.0 / (self.CELL * self._known[1])) + 4
+        cell = (x / (self.CELL * spacing[..., None])).floor().long().clamp(-1, nodes - 3) + 1
         flat = (cell[..., 0] * nodes + cell[..., 1]) * nodes + cell[..., 2]
         occupied = torch.zeros((len(x), nodes**3), dtype=torch.bool, device=x.device)
         occupied.scatter_(1, flat, True)
@@ -65,30 +76,29 @@ class SurfacePoints:
         for way in (1, nodes, nodes * nodes):
             for side in (-way, way):
                 inside &= occupied.gather(1, (flat + side).clamp(0, nodes**3 - 1))
-        # Particles of a body are in random order, so the first ones are distributed over its surface.
-        first = inside.byte().argsort(dim=1, stable=True)[:, : self._count]
+        # Particles of a body are in random order, so its first ones are distributed over its surface.
+        first = (inside + ranks).argsort(dim=1, stable=True)[:, : self._count]
         points = x.gather(1, first[..., None].expand(-1, -1, 3))
         if self._cameras:
-            seen = torch.stack([self._sees(sensor, points, like) for sensor in self._cameras]).any(0)
+            seen = torch.stack([self._sees(one, points, spacing, like) for one in self._cameras]).any(0)
             points = torch.cat([points, seen[..., None].float()], dim=2)
         return points if on_device(like) else points.numpy()
 
-    def _sees(self, sensor: CameraSensor, points: Any, like: Array) -> Any:
+    def _sees(self, sensor: CameraSensor, points: Any, spacing: Any, like: Array) -> Any:
         """Return whether points, shape [batch, point, 3], are visible to a camera."""
         import torch
 
-        camera = sensor.camera
-        depth = torch.as_tensor(sensor.capture("depth", like=like)["depth"])
+        camera, depth = sensor.camera, torch.as_tensor(sensor.capture("depth", like=like)["depth"])
         axes, position = (points.new_tensor(part) for part in (camera.axes(), camera.position))
         right, up, back = ((points - position) @ axes.T).unbind(-1)
         width, height = camera.size
         away = -back.clamp(max=-1e-6)
         column = (width / 2 + camera.focal_length * right / away).floor().long()
         row = (height / 2 - camera.focal_length * up / away).floor().long()
-        within = (back < 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        within = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (away > camera.near)
         pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
         nearest = depth.reshape(len(points), -1).gather(1, pixel)
-        return within & (away < nearest + 2.0 * self._spacing)
+        return within & (away < (nearest + 2.0 * spacing).clamp(max=camera.far))
 
 
 class Sensors:
@@ -280,8 +290,7 @@ def _shares(x: Array) -> Array:
 
 def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
     """Return points sampled from a mass tensor with a fixed seed, shape [count, 3]."""
-    rng = np.random.default_rng(0)
-    share = mass.clip(0.0).reshape(-1)
+    rng, share = np.random.default_rng(0), mass.clip(0.0).reshape(-1)
     nodes = rng.choice(share.size, count, p=share / share.sum())
     place = np.stack(np.unravel_index(nodes, mass.shape), axis=1) + rng.uniform(-0.5, 0.5, (count, 3))
     return (place / len(mass)).clip(0.0, 1.0)
