@@ -37,13 +37,10 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
     """Assert that a command line has been refused; return the message."""
     assert code == 2, f"exit code {code}: {argv}"
-    assert out == ""
-    assert "Traceback" not in err
+    assert out == "" and "Traceback" not in err
     lines = err.splitlines()
     assert lines, f"no message: {argv}"
-    assert lines[-1].startswith("plab: ")
-    assert len(lines) == 1
-    assert len(lines[-1]) > 15
+    assert lines[-1].startswith("plab: ") and len(lines) == 1 and len(lines[-1]) > 15
     return lines[-1]
 
 

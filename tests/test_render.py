@@ -174,8 +174,7 @@ def test_bodies_and_manipulators_are_drawn_where_they_are_with_their_shadows(pic
 
 def test_the_target_is_a_ghost_that_vanishes_where_it_is_reached_or_drawn_alone(pictures):
     ghost, floor = (color(pictures, name, GHOST) for name in ("all", "no target"))
-    assert floor.min() > 200 and np.ptp(floor) < 20
-    assert ghost[2] > ghost[0] + 5
+    assert floor.min() > 200 and np.ptp(floor) < 20 and ghost[2] > ghost[0] + 5
     assert np.all(ghost < floor) and ghost.min() > 100
     apart = {name: np.abs(pictures[name].astype(int) - pictures["no target"]) for name in ("all", "reached")}
     assert apart["all"][:, :10].mean() < 0.3 and apart["reached"].mean() < 1.0
@@ -260,8 +259,7 @@ def test_the_best_actions_of_a_result_are_replayed_as_a_strip(capsys, replayed, 
     assert main(["run.h5", "--size", "160x120", "--output", "deep/run.png"]) == 0
     assert capsys.readouterr().out == "deep/run.png\n"
     with Image.open("deep/run.png") as image:
-        assert image.width > 3 * SIZE[0] and image.height > SIZE[1]
-        assert np.asarray(image).std() > 10
+        assert image.width > 3 * SIZE[0] and image.height > SIZE[1] and np.asarray(image).std() > 10
     ((replay, given),) = replayed
     assert np.array_equal(given, found.best_actions)
     assert (replay.task, replay.sim, replay.variant, replay.seed_particles) == (cfg.task, cfg.sim, "2", 3)

@@ -79,8 +79,7 @@ def test_unpacked_files_are_result_files(folder: Path, tmp_path: Path) -> None:
     archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive)
     out = tmp_path / "out"
-    assert unpack(archive, out) == (2, 0)
-    assert unpack(archive, out) == (0, 2)
+    assert unpack(archive, out) == (2, 0) and unpack(archive, out) == (0, 2)
     names = {path.relative_to(out) for path in out.rglob("*.h5")}
     assert names == {path.relative_to(folder) for path in folder.rglob("*.h5")} - {
         path.relative_to(folder) for path in folder.rglob("*.partial.h5")
@@ -195,5 +194,4 @@ def test_check_names_each_faulty_run_and_archive(tmp_path: Path, capsys) -> None
     image = bytearray(archive.read_bytes())
     image[len(image) // 2] ^= 0xFF
     archive.write_bytes(image)
-    assert main(["check", str(archive)]) == 1
-    assert str(archive) in capsys.readouterr().out
+    assert main(["check", str(archive)]) == 1 and str(archive) in capsys.readouterr().out

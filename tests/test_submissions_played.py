@@ -151,8 +151,7 @@ def test_claims_are_simulated_again(
     out, err = capsys.readouterr()
     false, broke = err.splitlines()
     told = str(recorded), "v2 after 8", f"{lie.score:.4f}", f"{second.score:.4f}"
-    assert all(part in false for part in told)
-    assert "v1 after 9" in broke and "at step 2: not finite" in broke
+    assert all(part in false for part in told) and "v1 after 9" in broke and "at step 2: not finite" in broke
     assert "3 of 5 claim(s) hold" in out
     kept = read_verification(read(recorded))
     assert [v.outcome for v in kept] == [HOLDS, HOLDS, HOLDS, LIES, BROKE_OFF]

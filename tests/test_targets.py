@@ -69,8 +69,7 @@ def test_ring_lies_around_the_pillar(override):
     x = samples(scene, target)
     pillar = scene.manipulators[2].position
     from_axis = np.hypot(x[:, 0] - pillar[0], x[:, 2] - pillar[2])
-    assert x.shape == (10000, 3)
-    assert 0.105 <= from_axis.min() < 0.107 and 0.163 < from_axis.max() <= 0.165
+    assert x.shape == (10000, 3) and 0.105 <= from_axis.min() < 0.107 and 0.163 < from_axis.max() <= 0.165
     assert 0 <= x[:, 1].min() < 1e-3 and 0.059 < x[:, 1].max() <= 0.06
     # Uniform: the mean over the annulus of r is 2/3 (R^3 - r^3) / (R^2 - r^2), and all directions are equal.
     expected = 2 / 3 * (0.165**3 - 0.105**3) / (0.165**2 - 0.105**2)

@@ -154,8 +154,7 @@ def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypa
         assert run_config(cfg, CACHE) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out
-    assert out.count("\n") == 1
-    assert str(finished.path) in out and f"{finished.evaluation['score']:.4f}" in out
+    assert out.count("\n") == 1 and str(finished.path) in out and f"{finished.evaluation['score']:.4f}" in out
     # Another variant and material in the same simulator leave nothing behind.
     other = make_config(cfg.results_dir, "variant=3", "task.yield_stress=20")
     simulator = shared_problem(CACHE, [cfg]).simulator

@@ -139,8 +139,7 @@ def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
     archive, out = tmp_path / "a.plab.zip.xz", tmp_path / "out"
     archive.write_bytes(lzma.compress(make(saved(tmp_path / "results").read_bytes()), preset=0))
     line = said(unpack, archive, out)
-    assert line.startswith(str(archive)) and named in line
-    assert not out.exists()
+    assert line.startswith(str(archive)) and named in line and not out.exists()
     ((_, problem),) = check(archive)
     assert problem and problem in line
 
@@ -151,8 +150,7 @@ def test_runs_do_not_choose_where_they_are_unpacked(tmp_path: Path) -> None:
         config = synthetic.config(tmp_path, task=name)
         synthetic.write(dataclasses.replace(synthetic.run(tmp_path), config=config), path)
         archive.write_bytes(lzma.compress(zipped([("run.h5", path.read_bytes())]), preset=0))
-        assert f"'{name}'" in said(unpack, archive, tmp_path / "out")
-        assert not (tmp_path / "out").exists()
+        assert f"'{name}'" in said(unpack, archive, tmp_path / "out") and not (tmp_path / "out").exists()
 
 
 # ------------------------------------------------------------------------------------------------ arrays
@@ -204,7 +202,6 @@ def test_no_file_chooses_what_is_imported(tmp_path: Path, monkeypatch) -> None:
     run = synthetic.run(tmp_path / "results")
     run.config["method"]["family"] = "zz_evil:FAMILY"
     path = synthetic.save(run)
-    assert read(path).config["method"]["family"] not in FAMILIES
-    assert status.main([str(path)]) in (0, 2)
+    assert read(path).config["method"]["family"] not in FAMILIES and status.main([str(path)]) in (0, 2)
     list(check(path))
     assert "zz_evil" not in sys.modules and not (tmp_path / "marker").exists()
