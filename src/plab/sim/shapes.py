@@ -1,7 +1,7 @@
 """Signed distances of manipulators in their own frames, with normals and Hessian-vector products.
 
 :data:`SURFACES` has the functions of each shape of :data:`plab.scenes.MANIPULATOR_SHAPES`. All distances are
-exact, so normals have length 1, as required by the broad phase.
+exact, as required by the broad phase, so normals have length 1, except 0 at centres and axes of round shapes.
 """
 
 from collections.abc import Callable, Iterable
