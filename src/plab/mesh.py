@@ -84,7 +84,8 @@ class Mesh:
         """Read and check a mesh; see :func:`load_mesh` for arguments and errors."""
         if Path(file).suffix.lower() not in MESHES:
             raise ShapeError(f"{file} is not a mesh file: use {', '.join(MESHES)}")
-        self.sha256, surface = sha256, read_mesh(file, force="mesh")
+        self.sha256 = sha256
+        surface = read_mesh(file, force="mesh")
         faces = np.asarray(getattr(surface, "faces", []))
         if not len(faces):
             raise ShapeError(f"{file} has no faces")

@@ -95,7 +95,8 @@ def main(argv: Sequence[str]) -> None:
         parser.error(f"--name is of one dataset, but there are {len(tasks)} tasks: {', '.join(tasks)}")
     rows = []
     for task, own in tasks.items():
-        name, cfgs = options.name or f"plab/{task}-v0", [one.cfg for one in own]
+        name = options.name or f"plab/{task}-v0"
+        cfgs = [one.cfg for one in own]
         batch = EpisodeBatch(cfgs[: options.together], observe=observe, cameras=cameras)
         episodes = (one for one in _episodes(own, batch) if one.attributes["score"] >= options.min_score)
         sources = ", ".join(sorted({one.source for one in own}))
@@ -172,7 +173,8 @@ def _of_results(sources: Sequence[Path], words: Sequence[str], config_dir: str |
     # Without a gradient the memory budget has no effect, but must be equal in a batch.
     sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}
     sim |= {key[4:]: value for key, value in changes.items() if key.startswith("sim.")}
-    own, found = {key: value for key, value in changes.items() if key in OBSERVATION_KEYS}, []
+    own = {key: value for key, value in changes.items() if key in OBSERVATION_KEYS}
+    found = []
     for row in rows:
         cfg, actions = result(row.path)
         seen = {key: row.config[key] for key in OBSERVATION_KEYS} | own

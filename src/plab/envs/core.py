@@ -290,14 +290,16 @@ class EpisodeBatch:
 
     def _begin(self) -> None:
         """Observe the initial states before any episode has started."""
-        self.changed_by_hand, stages = 0, self.randomizer.last_stage
+        self.changed_by_hand = 0
+        stages = self.randomizer.last_stage
         # Sum of the rewards of completed stages, and score of each stage, 0 for future ones.
         self._earned, self._stage_scores = np.zeros(self.size), np.zeros((self.size, stages + 1))
         if stages:
             self.randomizer.enter_stages(dict.fromkeys(range(self.size), 0), self.problem)
             self.problem.refresh()
         # No step is left before the first reset.
-        self._steps, self._over = np.full(self.size, self.horizon), np.zeros(self.size, bool)
+        self._steps = np.full(self.size, self.horizon)
+        self._over = np.zeros(self.size, bool)
         # Environments with the same configuration have independent samples.
         ids = [id(cfg) for cfg in self.configs]
         self._seeds: list[tuple[int, ...]] = [
@@ -508,7 +510,8 @@ class EpisodeBatch:
         """Return the number of each environment's stage, and the score reached in each stage."""
         if not self.randomizer.last_stage:
             return {}
-        known, device = {"stage": self.randomizer.stages, "stage_scores": self._stage_scores}, on_device(like)
+        known = {"stage": self.randomizer.stages, "stage_scores": self._stage_scores}
+        device = on_device(like)
         return {key: like.new_tensor(value) if device else value.copy() for key, value in known.items()}
 
     @_alone
@@ -702,7 +705,8 @@ class Restorable:
         """Rebuild the environment, and restore the state."""
         self.__init__(**kept["arguments"])  # type: ignore[misc]
         self.batch.set_state(kept["state"])
-        self.spec, self._is_seeded = kept["spec"], True
+        self.spec = kept["spec"]
+        self._is_seeded = True
         self._np_random, self._np_random_seed = kept["random"]
 
     def _first_seeds(self, seed: int | Sequence[int] | None) -> Sequence[int] | None:

@@ -88,7 +88,8 @@ class SurfacePoints:
         """Return whether points, shape [batch, point, 3], are visible to a camera."""
         import torch
 
-        camera, depth = sensor.camera, torch.as_tensor(sensor.capture("depth", like=like)["depth"])
+        camera = sensor.camera
+        depth = torch.as_tensor(sensor.capture("depth", like=like)["depth"])
         axes, position = (points.new_tensor(part) for part in (camera.axes(), camera.position))
         right, up, back = ((points - position) @ axes.T).unbind(-1)
         width, height = camera.size
@@ -290,7 +291,8 @@ def _shares(x: Array) -> Array:
 
 def _sampled(mass: np.ndarray, count: int) -> np.ndarray:
     """Return points sampled from a mass tensor with a fixed seed, shape [count, 3]."""
-    rng, share = np.random.default_rng(0), mass.clip(0.0).reshape(-1)
+    rng = np.random.default_rng(0)
+    share = mass.clip(0.0).reshape(-1)
     nodes = rng.choice(share.size, count, p=share / share.sum())
     place = np.stack(np.unravel_index(nodes, mass.shape), axis=1) + rng.uniform(-0.5, 0.5, (count, 3))
     return (place / len(mass)).clip(0.0, 1.0)

@@ -100,7 +100,8 @@ class EpisodeRandomizer:
         }
         targets = _stage_targets(cfgs, problem) if stages else []
         targets.append(list(zip(problem.target_mass, problem.distances(), strict=True)))
-        self.last_stage, by_environment = len(targets) - 1, map(list, zip(*targets, strict=True))
+        self.last_stage = len(targets) - 1
+        by_environment = map(list, zip(*targets, strict=True))
         self._bases = [_Base(*one) for one in zip(cfgs, problem.scenes, by_environment, strict=True)]
         # With the changes that the caller has made in the simulator.
         self._scenes = list(problem.scenes)
@@ -183,7 +184,8 @@ class EpisodeRandomizer:
         Values by dotted key in ``given`` replace samples, for all or one per sub-environment; raise
         ValueError if a key is unknown."""
         cfg = self._cfgs[e]
-        pool, rng = self._pools.get(id(cfg), ()), np.random.default_rng(list(seed))
+        pool = self._pools.get(id(cfg), ())
+        rng = np.random.default_rng(list(seed))
         values = draw(self._bounds[id(cfg)], rng)
         if pool:
             values[SCENE] = int(rng.integers(len(pool)))

@@ -55,9 +55,11 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
-        self.render_mode, self._mode = check_render_mode(render_mode), AutoresetMode(autoreset_mode)
+        self.render_mode = check_render_mode(render_mode)
+        self._mode = AutoresetMode(autoreset_mode)
         self.metadata = METADATA | {"autoreset_mode": self._mode}  # type: ignore[misc]
-        self.batch, self.num_envs = make_batch(task, variant, num_envs=num_envs, **options), num_envs
+        self.batch = make_batch(task, variant, num_envs=num_envs, **options)
+        self.num_envs = num_envs
         self.single_observation_space = self.batch.observation_space
         self.single_action_space = self.batch.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -105,7 +107,8 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         if idle.any():
             observation, first = self.batch.reset(environments=np.flatnonzero(idle))
             info = _mixed(info, first, idle)
-        info, over = self._masked(info), terminated | truncated
+        info = self._masked(info)
+        over = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and over.any():
             ended: dict[str, Any] = {}
             for e in np.flatnonzero(over).tolist():

@@ -70,9 +70,11 @@ class JointActions:
         for joint in first.joints:
             depth.append(depth[joint.parent] + 1 if joint.parent >= 0 else 0)
         levels = [[j for j, d in enumerate(depth) if d == k] for k in range(max(depth) + 1)]
-        order, self._sizes = [j for level in levels for j in level], [len(level) for level in levels]
+        order = [j for level in levels for j in level]
+        self._sizes = [len(level) for level in levels]
         below = [[first.joints[j].parent for j in level] for level in levels[1:]]
-        self._components, self._order = [joint.component for joint in first.joints], order
+        self._components = [joint.component for joint in first.joints]
+        self._order = order
         # Index of each joint's parent in the level above, and of each link's joint, where 0 is the world.
         self._parents = [[levels[k].index(j) for j in parents] for k, parents in enumerate(below)]
         self._carriers = [order.index(k.parent) + 1 if k.parent >= 0 else 0 for k in first.links]
@@ -111,7 +113,8 @@ class JointActions:
         """Twists and final joint positions of :meth:`drive`."""
         c = self._on(given.device)
         own = given[..., self._direct :].clamp(-1.0, 1.0).permute(2, 0, 1)
-        moves, at = _rows(own, self._components) * c["scale"][:, None], [before.T]
+        moves = _rows(own, self._components) * c["scale"][:, None]
+        at = [before.T]
         for move in moves.unbind(1):
             at.append((at[-1] + move).clamp(c["low"], c["high"]))
         frames = self.frames(torch.stack(at, 1))
@@ -140,7 +143,8 @@ class JointActions:
     def frames(self, joints: Tensor) -> Tensor:
         """Transforms from the links' frames to the world, shape [link, 4, 4, T, batch], given joint
         positions, shape [joint, T, batch]."""
-        c, at = self._on(joints.device), _rows(joints, self._order)[:, None, None]
+        c = self._on(joints.device)
+        at = _rows(joints, self._order)[:, None, None]
         still, sine, cosine, slide = c["motions"].unbind(1)
         moved = still + at.sin() * sine + (1.0 - at.cos()) * cosine + at * slide
         own = moved.split(self._sizes)
@@ -192,7 +196,8 @@ def _twists(old: Tensor, new: Tensor) -> Tensor:
     turn = _Product.apply(new[:, :3, :3], old[:, :3, :3].transpose(1, 2)).unbind(1)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(1) for row in turn)
     x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
-    square, cosine = x**2 + y**2 + z**2, 0.5 * (xx + yy + zz - 1.0)
+    square = x**2 + y**2 + z**2
+    cosine = 0.5 * (xx + yy + zz - 1.0)
     small = (square < 1e-8) & (cosine > 0.0)
     sine = square.masked_fill(small, 1.0).sqrt()
     # angle / sin(angle), as a series in sin(angle)^2 near 0. Not by atan2, whose last bits depend on the

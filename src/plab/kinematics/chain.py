@@ -172,13 +172,15 @@ class Chain:
             ModelError: If a pattern matches no joint, limits are not in order, an initial position is outside
                 them, or no joint can move.
         """
-        turn, place = pose_matrix((0.0, 0.0, 0.0), rotation), pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
+        turn = pose_matrix((0.0, 0.0, 0.0), rotation)
+        place = pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
         base: list[Joint] = []
         for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ()):
             most = math.pi if k >= 3 else 1.0
             offset = _tuples(np.eye(4) if k else place)
             base.append(Joint(name, k - 1, offset, k >= 3, axis, low=-most, high=most))
-        first, shift = turn if base else place @ turn, len(base)
+        first = turn if base else place @ turn
+        shift = len(base)
 
         def moved(node: Node) -> Node:
             if node.parent >= 0:

@@ -107,7 +107,8 @@ def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Ch
         and m.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE
     ]
     names = [m.geom(g).name or f"geom{g}" for g in geoms]
-    left_out, links = matched("omit", dict.fromkeys(omit, True), names), []
+    left_out = matched("omit", dict.fromkeys(omit, True), names)
+    links = []
     for g, name in zip(geoms, names, strict=True):
         if name in left_out:
             continue
