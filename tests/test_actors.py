@@ -17,8 +17,8 @@ from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.pods import PodsRunner
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.shac import td_lambda
-from plab.runners.training import DEVIATION_MIN, shared_batches, training_scenes
+from plab.runners.shac import ShacRunner, td_lambda
+from plab.runners.training import DEVIATION_MIN, ActorRunner, shared_batches, training_scenes
 from plab.scenes import SceneError
 from same_runs import CACHE, finished_as, run, stopped_at
 from toy_runner import COARSE_32
@@ -49,8 +49,9 @@ def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
     return training, judge
 
 
-def prepared(cfg: Config) -> PodsRunner:
-    runner = PodsRunner([SimpleNamespace(cfg=cfg)], "", CACHE)
+def prepared(cfg: Config) -> ActorRunner:
+    kind = {"pods": PodsRunner, "shac": ShacRunner}[cfg.method.name]
+    runner = kind([SimpleNamespace(cfg=cfg)], "", CACHE)
     runner.prepare(environments(cfg)[0])
     return runner
 
@@ -162,8 +163,9 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.h5"))
 
 
-def test_rounds_take_the_drawn_scenes_in_turn() -> None:
-    words = "results", "pods", "method.epochs=1", "+task.randomize.yield_stress=[20,200]"
+@pytest.mark.parametrize("name", METHODS)
+def test_rounds_take_the_drawn_scenes_in_turn(name: str) -> None:
+    words = "results", name, "method.scenes=5", "+task.randomize.yield_stress=[20,200]"
     cfg = make_config(*words)
     batch, _ = environments(cfg)
     training, taken, sampled = prepared(cfg), [], []

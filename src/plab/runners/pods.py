@@ -20,14 +20,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
 from plab.runners.bc import ImitationRunner
 from plab.runners.policy import set_rate
-from plab.runners.training import ActorConfig, training_scenes
+from plab.runners.training import ActorConfig
 
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
@@ -72,9 +70,8 @@ class PodsRunner(ImitationRunner):
     def learn(self, rate_left: float) -> None:
         """Run a round: act, improve the actions, and imitate them."""
         method, batch, self._failed = self.method, self.batch, set[int]()
-        if self._turns > 1:
-            turn = self.episodes // (self.round_episodes[0] * batch.size)
-            batch.renew(training_scenes(self._cfg, batch.size, turn))
+        # All episodes of a round use the samples of the round.
+        self._numbers = self.begin_round()
         self.freeze_moments()
         before, actions = self._episode(None, "train")
         improved = self._improved(actions, method.action_lr * rate_left)
@@ -98,10 +95,7 @@ class PodsRunner(ImitationRunner):
         from plab.envs.tensors import TensorEnv
 
         env, observed, taken, total = TensorEnv(self.batch), [], [], 0.0
-        # All episodes of a round use the samples of the round.
-        size = self.batch.size
-        turn = self.episodes // (self.round_episodes[0] * size)
-        seen = env.reset(episode=turn * size + np.arange(size))
+        seen = env.reset(episode=self._numbers)
         for t in range(self._horizon):
             with torch.no_grad():
                 chosen = self.network(self.scaled(seen)) if actions is None else actions[:, t]

@@ -17,8 +17,6 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from plab.config import ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.plugins import torch
@@ -96,7 +94,7 @@ class ShacRunner(ActorRunner):
 
         batch, method = self.batch, self.method
         parameters = list(self.network.parameters())
-        _, info = batch.reset(episode=self.episodes + np.arange(batch.size))
+        _, info = batch.reset(episode=self.begin_round())
         initial = torch.as_tensor(info["loss"], dtype=torch.float32, device=self._device)
         # Rewards relative to the initial loss.
         scale = initial.mean().clamp(min=1e-12)

@@ -387,6 +387,15 @@ class ActorRunner(PolicyRunner):
     def learn(self, rate_left: float) -> None:
         """Run a round of training episodes; ``rate_left`` decreases linearly from 1 to 0 during training."""
 
+    def begin_round(self) -> np.ndarray:
+        """Continue with the next scenes if there are more than environments; return the numbers of the
+        round's episodes by environment, which determine the random samples."""
+        size = self.batch.size
+        turn = self.episodes // (self.round_episodes[0] * size)
+        if self.method.scenes > size:
+            self.batch.renew(training_scenes(self._cfg, size, turn))
+        return turn * size + np.arange(size)
+
     def policy(self, run: int) -> Policy:
         return Policy(self.network, *self._moments)
 
