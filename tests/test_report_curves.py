@@ -50,7 +50,7 @@ def test_values_below_zero_count_as_zero_run_by_run() -> None:
 
 
 def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
-    rows = pd.DataFrame({"loss": [5.0, 3.0, 4.0, 2.0], "score": [0.4, 0.1, 0.6, 0.3]})
+    rows = pd.DataFrame({"loss": [5.0, 3.0, 3.0, 2.0], "score": [0.4, 0.1, 0.6, 0.3]})
     rows = rows.assign(episodes=range(4), steps=range(4), seconds=1.0)
     budgets = {"steps_forward": [10, 20, 30, 40], "steps_gradient": [0, 5, 5, 10]}
     sim = {"horizon": 50, "substeps": 2}
@@ -59,6 +59,9 @@ def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
         return statistics.rows_on_axes({"method": {"family": family}, "sim": sim}, rows.assign(**budgets), 2)
 
     assert table("trajectory")["best_score"].tolist() == [0.4, 0.1, 0.1, 0.3]
+    budgets["kept_score"] = [np.nan, 0.2, 0.2, 0.5]
+    assert table("trajectory")["best_score"].tolist() == [0.4, 0.2, 0.2, 0.5]
+    del budgets["kept_score"]
     # The best row of the external method has not the lowest loss.
     for family in ("planner", "own:FAMILY"):
         assert table(family)["best_score"].tolist() == [0.4, 0.4, 0.6, 0.6]

@@ -222,9 +222,12 @@ def rows_on_axes(config: Mapping[str, Any], rows: Rows, best_iteration: int) -> 
     if by_score or (known is not None and known.ranking == "score"):
         best = np.maximum.accumulate(rows["score"])
     else:
-        # Row of the lowest loss so far.
-        lowest = np.where(rows["loss"] == np.minimum.accumulate(rows["loss"]), np.arange(len(simulated)), 0)
-        best = rows["score"][np.maximum.accumulate(lowest)]
+        # First row with the lowest loss so far: among equal losses, a run keeps the first.
+        lowest = np.minimum.accumulate(rows["loss"])
+        best = rows["score"][np.searchsorted(-lowest, -lowest)]
+    if "kept_score" in rows:
+        # From the first check, these runs keep the actions with the highest score in the hard contact model.
+        best = np.where(np.isnan(rows["kept_score"]), best, rows["kept_score"])
     return {
         **rows,
         "seconds": np.cumsum(rows["seconds"]),

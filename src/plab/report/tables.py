@@ -393,8 +393,8 @@ def score_at_budget(runs: Runs, series: Series) -> list[Table]:
     data = pd.DataFrame(rows, columns=["task", "method", "runs", "steps", "score", "low", "high", "seconds"])
     notes = [
         "Score of the best actions found within a budget of simulated environment steps; steps with and "
-        "without gradient count equally. Planners and RL methods are evaluated in the hard contact model, "
-        "gradient methods in that of their rollouts.",
+        "without gradient count equally. The contact model is hard; for apg, and for adam, gd and adam_h "
+        "before their first check, it is that of their rollouts.",
         f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t from the variances within "
         "variants, none if a variant has one run.",
         "A finished run keeps its score. A method has a score once all of its runs have a row.",
