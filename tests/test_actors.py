@@ -50,8 +50,8 @@ def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
 
 
 def prepared(cfg: Config) -> ActorRunner:
-    kind = {"pods": PodsRunner, "shac": ShacRunner}[cfg.method.name]
-    runner = kind([SimpleNamespace(cfg=cfg)], "", CACHE)
+    kinds = {"pods": PodsRunner, "shac": ShacRunner}
+    runner = kinds[cfg.method.name]([SimpleNamespace(cfg=cfg)], "", CACHE)
     runner.prepare(environments(cfg)[0])
     return runner
 
@@ -208,8 +208,7 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsRunner, monkey
 
 
 def test_what_is_observed_is_moved_together() -> None:
-    words = "method.shift=0.1", "method.observation_noise=0", "method.scenes=0"
-    cfg = make_config("results", "pods", *words)
+    cfg = make_config("results", "pods", "method.shift=0.1", "method.observation_noise=0", "method.scenes=0")
     batch, _ = environments(cfg)
     training, given = prepared(cfg), []
     training.statistics.var = np.linspace(0.25, 4.0, batch.observation_space.shape[0])

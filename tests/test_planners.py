@@ -89,16 +89,17 @@ def drawn(mean: torch.Tensor, std: torch.Tensor | float, iteration: int, best: t
     return points
 
 
-@pytest.mark.parametrize(("elites", "fitted"), [(2, 2), (5, 5), (6, 2)])
-def test_cem_fits_mean_and_spread_to_the_elites(elites: int, fitted: int) -> None:
+@pytest.mark.parametrize(("elites", "fitted", "whole"), [(2, 2, 5), (5, 5, 5), (6, 2, 5), (3, 1, 1)])
+def test_cem_fits_mean_and_spread_to_the_elites(elites: int, fitted: int, whole: int) -> None:
     settings = (f"elites={elites}", "smoothing=0.1", "least_spread=0.3", "spread=0.5")
     search = make_planner(rule("cem", *settings), *START)
-    first, second, third = (iterate(search, i)[0][0].actions for i in range(3))
+    first, second, third = (iterate(search, i, range(whole, 5))[0][0].actions for i in range(3))
     torch.testing.assert_close(first, 0.3 * uniform(random(0), 5))
-    torch.testing.assert_close(second, drawn(best_of(first), 0.5, 1, best_of(first)))
-    best = second[costs(second).argsort()[:fitted]]
-    mean, std = 0.9 * best.mean(0) + 0.1 * best_of(first), 0.9 * best.std(0).clamp(min=0.3) + 0.1 * 0.5
-    torch.testing.assert_close(third, drawn(mean, std, 2, best_of(second)))
+    start = best_of(first[:whole])
+    torch.testing.assert_close(second, drawn(start, 0.5, 1, start))
+    best = second[costs(second[:whole]).argsort()[:fitted]]
+    std = 0.9 * best.std(0, correction=min(1, fitted - 1)).clamp(min=0.3) + 0.1 * 0.5
+    torch.testing.assert_close(third, drawn(0.9 * best.mean(0) + 0.1 * start, std, 2, best[0]))
 
 
 def test_mppi_weighs_draws_by_their_costs() -> None:
@@ -272,8 +273,7 @@ def test_a_run_improves_on_its_start_and_tells_what_it_cost(finished, method: st
     # In the soft model each of two updates, and before them a judgement in the hard one, which needs none.
     spent = {"multistart": [4, 8], "hybrid": [4, 4], "solve": [4, 6]}.get(method, [4, 0])
     assert rows[list(BUDGETS)].iloc[-1].tolist() == [4 * STEPS * n for n in spent]
-    each = rows["steps_forward"] + rows["steps_gradient"]
-    assert rows["steps"].tolist() == [0, *each[:-1]]
+    assert rows["steps"].tolist() == [0, *(rows["steps_forward"] + rows["steps_gradient"])[:-1]]
     assert rows["episodes"].tolist() == [steps // STEPS for steps in rows["steps"]]
 
 

@@ -55,13 +55,13 @@ def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
     budgets = {"steps_forward": [10, 20, 30, 40], "steps_gradient": [0, 5, 5, 10]}
     sim = {"horizon": 50, "substeps": 2}
 
-    def table(family: str) -> pd.DataFrame:
-        return statistics.rows_on_axes({"method": {"family": family}, "sim": sim}, rows.assign(**budgets), 2)
+    def table(family: str, **more: list[float]) -> pd.DataFrame:
+        own = rows.assign(**budgets, **more)
+        return statistics.rows_on_axes({"method": {"family": family}, "sim": sim}, own, 2)
 
     assert table("trajectory")["best_score"].tolist() == [0.4, 0.1, 0.1, 0.3]
-    budgets["kept_score"] = [np.nan, 0.2, 0.2, 0.5]
-    assert table("trajectory")["best_score"].tolist() == [0.4, 0.2, 0.2, 0.5]
-    del budgets["kept_score"]
+    kept = table("trajectory", kept_score=[np.nan, 0.2, 0.2, 0.5])
+    assert kept["best_score"].tolist() == [0.4, 0.2, 0.2, 0.5]
     # The best row of the external method has not the lowest loss.
     for family in ("planner", "own:FAMILY"):
         assert table(family)["best_score"].tolist() == [0.4, 0.4, 0.6, 0.6]

@@ -205,8 +205,8 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
         Task, variant, method and seed of each run, and its iterations, with the columns of docs/results.md
         and some changes: ``seconds`` is the wall time since the start of the first row, ``simulated`` the
         simulated environment steps, ``substeps`` the simulated substeps, all at the end of the row;
-        ``best_score`` is the score of the best actions so far; ``episodes`` includes the row's own episode,
-        so that it starts at 1.
+        ``best_score`` is the score of the best actions so far, ``kept_score`` if known; ``episodes``
+        includes the row's own episode, so that it starts at 1.
     """
     names = runs.table[["task", "variant", "method", "seed"]].astype(str).to_dict("records")
     found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]), runs.table["best_iteration"])
@@ -226,7 +226,6 @@ def rows_on_axes(config: Mapping[str, Any], rows: Rows, best_iteration: int) -> 
         lowest = np.minimum.accumulate(rows["loss"])
         best = rows["score"][np.searchsorted(-lowest, -lowest)]
     if "kept_score" in rows:
-        # From the first check, these runs keep the actions with the highest score in the hard contact model.
         best = np.where(np.isnan(rows["kept_score"]), best, rows["kept_score"])
     return {
         **rows,

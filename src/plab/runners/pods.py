@@ -60,7 +60,6 @@ class PodsRunner(ImitationRunner):
         # Episodes of the policy, with gradient, and with the improved actions.
         self.round_episodes = self.method.updates + 2, self.method.updates
         super().prepare(batch)
-        self._turns = max(1, math.ceil(self.method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def environments(self, cfg: Config) -> list[Config]:
@@ -70,7 +69,6 @@ class PodsRunner(ImitationRunner):
     def learn(self, rate_left: float) -> None:
         """Run a round: act, improve the actions, and imitate them."""
         method, batch, self._failed = self.method, self.batch, set[int]()
-        # All episodes of a round use the samples of the round.
         self._numbers = self.begin_round()
         self.freeze_moments()
         before, actions = self._episode(None, "train")
@@ -84,7 +82,7 @@ class PodsRunner(ImitationRunner):
             self.freeze_moments()
             set_rate(self._optimizer, method.lr * rate_left)
             # The latest round of each scene.
-            self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]
+            self._rounds = [*self._rounds, (seen, wanted)][-max(1, math.ceil(method.scenes / batch.size)) :]
             every, given = map(torch.cat, zip(*self._rounds, strict=True))
             count = math.ceil(method.epochs * len(seen) / method.batch_size)
             self.imitate(self.scaled(every), given, count)

@@ -221,8 +221,8 @@ class CemConfig(SamplerConfig):
     """Cross-entropy method.
 
     Attributes:
-        elites: Number of candidates that determine mean and standard deviation; half of the population if
-            that is smaller.
+        elites: Number of candidates that determine mean and standard deviation, without diverged ones; half
+            of the population if that is smaller.
         smoothing: Weight of the old mean and standard deviation.
         least_spread: Lower bound of the standard deviation.
     """
@@ -246,9 +246,9 @@ class Cem(Sampler):
     def learn(self, points: Tensor, cost: Tensor) -> None:
         wanted, population = self.method.elites, self.method.population
         count = wanted if wanted <= population else population // 2
-        elites = points[cost.argsort(stable=True)[:count]]
-        mean, std = elites.mean(0), elites.std(0).clamp(min=self.method.least_spread)
-        self.memory["mean"] = torch.lerp(mean, self.memory["mean"], self.method.smoothing)
+        elites = points[cost.argsort(stable=True)[: min(count, int(cost.isfinite().sum()))]]
+        std = elites.std(0, correction=len(elites) > 1).clamp(min=self.method.least_spread)
+        self.memory["mean"] = torch.lerp(elites.mean(0), self.memory["mean"], self.method.smoothing)
         self.memory["std"] = torch.lerp(std, self.memory["std"], self.method.smoothing)
 
 

@@ -388,8 +388,7 @@ class ActorRunner(PolicyRunner):
         """Run a round of training episodes; ``rate_left`` decreases linearly from 1 to 0 during training."""
 
     def begin_round(self) -> np.ndarray:
-        """Continue with the next scenes if there are more than environments; return the numbers of the
-        round's episodes by environment, which determine the random samples."""
+        """Take the next scenes if they outnumber the environments; return the round's episode numbers."""
         size = self.batch.size
         turn = self.episodes // (self.round_episodes[0] * size)
         if self.method.scenes > size:
