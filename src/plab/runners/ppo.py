@@ -22,7 +22,7 @@ class PpoConfig(RlConfig):
     Attributes:
         lr_decay: Whether the learning rate decreases linearly to 0 over the run.
         steps_per_update: Transitions per update.
-        minibatches: Minibatches of each epoch.
+        minibatches: Largest number of minibatches of each epoch; all but the last are equally large.
         epochs: Passes over the transitions of an update.
         gae_lambda: Lambda of the generalised advantage estimate.
         clip_range: Largest change of the probability ratio.
