@@ -159,6 +159,7 @@ BROKEN = {
         r, columns={name: values for name, values in r.columns.items() if name != "reward"}
     ),
     "iterations are not finite: loss_sdf": lambda r: _table(r, "loss_sdf", 1, np.nan),
+    "iterations are not finite: gradient_norm": lambda r: _table(r, "gradient_norm", 1, np.nan),
     "iterations are not numbered": lambda r: _table(r, "iteration", 1, 5),
     "steps decrease": lambda r: _table(r, "steps", 1, 500),
     r"score leaves \[0, 1\]": lambda r: _table(r, "score", 2, 1.5),

@@ -61,7 +61,8 @@ class Family:
         config: Type of the ``method`` section, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
-        columns: Additional columns of the results, which may contain NaN.
+        columns: Additional columns of the results.
+        may_be_nan: Columns that may contain NaN.
         ranking: Criterion for the best actions of a run: lowest ``loss``, or highest ``score`` in the hard
             contact model, with ties broken by loss.
         batching: Whether runs can share a simulator; otherwise they are executed one by one.
@@ -74,6 +75,7 @@ class Family:
     config: type
     runner: type | str
     columns: tuple[str, ...] = ()
+    may_be_nan: tuple[str, ...] = ()
     ranking: str = "loss"
     batching: bool = False
     in_step: bool = False

@@ -68,11 +68,13 @@ def _iteration_faults(run: RunResult) -> Iterator[str]:
     table, family = run.columns, known_family(run.config["method"]["family"])
     common = (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
+    # Additional columns of external families are not checked.
+    may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
     if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
     for name, values in table.items():
-        if name in common and not np.isfinite(values).all():
+        if name not in may_be_nan and not np.isfinite(values).all():
             yield f"iterations are not finite: {name}"
         if name in ("episodes", "steps", *BUDGETS) and (np.diff(values) < 0).any():
             yield f"{name} decrease"

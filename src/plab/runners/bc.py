@@ -126,6 +126,7 @@ FAMILY = Family(
     config=BcConfig,
     runner=BcRunner,
     columns=("imitation_error",),
+    may_be_nan=("imitation_error",),
     ranking="score",
     rules={"bc": Rule(BcRunner, BcConfig)},
     methods={"bc": Appearance("BC", "#661100", "-.")},

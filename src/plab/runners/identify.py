@@ -175,7 +175,8 @@ class IdentifyRunner(Runner):
         found["misfit"] = float(np.sqrt(each * state["cost"] / residual.size))
         for name, log, deviation in zip(method.parameters, state["best"], deviations, strict=True):
             found |= {name: float(np.exp(log)), f"{name}_deviation": float(np.exp(log) * deviation)}
-        return Step(measured | found, self._actions, dict(state), steps_forward=seen.shape[0] * seen.shape[1])
+        steps = len(self._actions) * len(scenes)
+        return Step(measured | found, self._actions, dict(state), steps_forward=steps)
 
     def close(self) -> None:
         """Restore the configuration's scene."""
@@ -239,5 +240,6 @@ FAMILY = Family(
     config=IdentifyConfig,
     runner=IdentifyRunner,
     columns=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
+    may_be_nan=("misfit", *PARAMETERS, *(f"{name}_deviation" for name in PARAMETERS)),
     methods={"identify": Appearance("Identify", "#555555", ":")},
 )

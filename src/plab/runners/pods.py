@@ -135,10 +135,13 @@ class PodsRunner(ImitationRunner):
         self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in state["rounds"]]
 
 
+_COLUMNS = ("train_reward", "train_score", "plan_reward", "plan_score")
+
 FAMILY = Family(
     config=PodsConfig,
     runner=PodsRunner,
-    columns=("train_reward", "train_score", "plan_reward", "plan_score"),
+    columns=_COLUMNS,
+    may_be_nan=_COLUMNS,
     rules={"pods": Rule(PodsRunner, PodsConfig)},
     kind=GRADIENT,
     methods={"pods": Appearance("PODS", "#999933", "--")},

@@ -156,6 +156,8 @@ FAMILY = Family(
     config=RlConfig,
     runner=RlRunner,
     columns=("train_reward", "train_score"),
+    # There may be no completed training episode.
+    may_be_nan=("train_reward", "train_score"),
     batching=True,
     in_step=True,
     rules={

@@ -157,6 +157,7 @@ FAMILY = Family(
     config=ShacConfig,
     runner=ShacRunner,
     columns=("train_reward", "train_score"),
+    may_be_nan=("train_reward", "train_score"),
     rules={"shac": Rule(ShacRunner, ShacConfig)},
     kind=GRADIENT,
     methods={"shac": Appearance("SHAC", "#DDAA33", ":")},

@@ -287,6 +287,7 @@ FAMILY = Family(
     config=TrajectoryConfig,
     runner=TrajectoryRunner,
     columns=("gradient_norm", "kept_score"),
+    may_be_nan=("kept_score",),
     batching=True,
     rules={"adam": Rule(Adam), "gd": Rule(Momentum)},
     kind=GRADIENT,
