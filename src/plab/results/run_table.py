@@ -16,7 +16,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -48,6 +48,7 @@ from plab.results.run_file import (
     summary_of,
 )
 from plab.results.run_file import COLUMNS as ITERATION_COLUMNS
+from plab.results.running import held
 
 T = TypeVar("T")
 
@@ -110,6 +111,7 @@ def load(source: Source = "results", keys: Sequence[str] = (), *, index: bool = 
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
         best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
         of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
+        ``status`` is ``finished``, ``running``, ``interrupted`` or ``failed``, as in ``plab status``.
         ``score_best``, ``iou`` and ``loss`` are those of the final evaluation, NaN before it. ``score``
         equals ``score_best``, or the score of the last iteration with ``protocol.score=last``: see
         :attr:`RunResult.score`.
@@ -153,7 +155,7 @@ def rows(
     unreadable = [entry for entry in entries if isinstance(entry, ResultsError)]
     if unreadable and not found and not any(root.is_dir() for root in roots):
         raise unreadable[0]
-    found = _without_repetitions(found)
+    found = [_with_current_status(row) for row in _without_repetitions(found)]
     if chosen is not None:
         require_possible(chosen, found)
         found = [row for row in found if chosen(row.values, row.config)]
@@ -295,6 +297,15 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
             loose = list({row.path.resolve(): row for row in loose}.values())
         kept += loose or best[:1]
     return kept
+
+
+def _with_current_status(row: Row) -> Row:
+    """Replace the status in the file of an unfinished run, which may have been killed or resumed since."""
+    status = row.values["status"]
+    if status != "finished":
+        ended = "failed" if status == "failed" else "interrupted"
+        status = "running" if held(row.path) else ended
+    return replace(row, values=row.values | {"status": status})
 
 
 def _row(file: h5py.File, path: Path) -> Row:
