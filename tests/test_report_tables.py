@@ -174,6 +174,7 @@ def test_mixed_settings_are_refused_with_advice(tmp_path: Path) -> None:
     [
         ("task.yield_stress", (200.0, 50.0, 10.0)),
         ("seed_particles", (0, 1)),
+        ("task.manipulators.pillar.friction", (0.9, 0.1)),
         ("method.loss_terms", ({"contact": "nearest"}, {"contact": "soft"})),
     ],
 )
@@ -197,7 +198,7 @@ def test_protocols_are_not_mixed(tmp_path: Path) -> None:
     synthetic.save(synthetic.run(tmp_path, seed=0))
     own = load_config(["protocol=release", "task=Rope"])
     released = {"protocol": dataclasses.asdict(own.protocol), "method.loss_terms": own.method.loss_terms}
-    released["task.yield_stress"] = own.task.yield_stress
+    released["task"] = config_dict(own)["task"]
     save(tmp_path, released, seed=1)
     with pytest.raises(ArgumentError, match=r"plab and release: .* protocol\.name=plab"):
         gather(tmp_path)
