@@ -13,8 +13,8 @@ from plab.config.selection import Selection, one_protocol
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.errors import printable
 from plab.plugins import pandas as pd
-from plab.results import ResultsError, Row, row_count
-from plab.results.run_file import NAMES, columns_of, opened, summary_of
+from plab.results import ResultsError, Row
+from plab.results.run_file import NAMES, columns_of, opened, row_count, summary_of
 from plab.results.run_table import Source, rows
 
 __all__ = ["NAMES", "STATES", "Survey", "survey"]
