@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plab.config.run import config_hash, member_name
+from plab.config.suite import SUITE_VARIANTS, choices
 from plab.results import RunResult, write
 from synthetic_runs import synthetic_run, template
 
@@ -16,14 +17,15 @@ ROWS = 4
 
 
 @functools.cache
-def _template(method: str) -> dict[str, Any]:
+def _template(method: str, task: str, variant: str) -> dict[str, Any]:
     length = "method.episodes=100" if method in ("sac", "td3", "ppo") else f"method.iterations={ROWS}"
-    return template(method, [length])
+    shipped = task in choices("task") and variant in SUITE_VARIANTS
+    return template(method, [length, *([f"task={task}", f"variant={variant}"] if shipped else [])])
 
 
 def config(folder: Path, task: str = "Rope", variant: str = "1", method: str = "adam", seed: int = 0) -> dict:
     """Return a run's configuration."""
-    made = copy.deepcopy(_template(method))
+    made = copy.deepcopy(_template(method, task, variant))
     made["task"]["name"] = task
     return made | {"variant": variant, "seed": seed, "results_dir": str(folder)}
 

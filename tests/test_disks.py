@@ -19,7 +19,7 @@ from faults import DEATH, Death, Failing, contents, watched
 from plab.cli import status
 from plab.cli.run import main
 from plab.config import ConfigError
-from plab.results import SCHEMA_VERSION, RunFile, read
+from plab.results import RunFile, read, run_file
 from plab.results.running import acquire, held, lock_path
 from plab.runners import run_batch
 from refusals import snapshot
@@ -106,7 +106,7 @@ def test_damaged_files_are_computed_again_and_newer_and_locked_ones_left_alone(c
     cut, newer, locked = (cfg.path for cfg in configs())
     cut.write_bytes(cut.read_bytes()[:1000])
     with h5py.File(newer, "r+") as file:
-        file.attrs["schema_version"] = SCHEMA_VERSION + 1
+        file.attrs["schema_version"] = run_file.SCHEMA_VERSION + 1
     before = newer.read_bytes(), locked.read_bytes()
     capsys.readouterr()
     with locked.open() as file:

@@ -17,7 +17,7 @@ import reference_mpm as reference
 from plab.config import Config, MethodConfig, build_scene, load_config
 from plab.objective import spread_mass
 from plab.problem import Problem
-from plab.results import BUDGETS, RunFile, RunResult, checking, read
+from plab.results import RunFile, RunResult, checking, read, run_file
 from plab.results.checking import faults
 from plab.runners import RunError, Step, Track, run_batch, run_config, runner
 from plab.runners.contact_starts import ContactStarts
@@ -272,7 +272,7 @@ def test_a_run_improves_on_its_start_and_tells_what_it_cost(finished, method: st
     assert "the best" in faults(replace(result, best_iteration=int(rows["score"].argmin())))[0]
     # In the soft model each of two updates, and before them a judgement in the hard one, which needs none.
     spent = {"multistart": [4, 8], "hybrid": [4, 4], "solve": [4, 6]}.get(method, [4, 0])
-    assert rows[list(BUDGETS)].iloc[-1].tolist() == [4 * STEPS * n for n in spent]
+    assert rows[list(run_file.BUDGETS)].iloc[-1].tolist() == [4 * STEPS * n for n in spent]
     assert rows["steps"].tolist() == [0, *(rows["steps_forward"] + rows["steps_gradient"])[:-1]]
     assert rows["episodes"].tolist() == [steps // STEPS for steps in rows["steps"]]
 

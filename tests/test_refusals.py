@@ -148,6 +148,7 @@ TOOLS = [
     (status.main, ". task=Ropee", "did you mean Rope?"),
     (status.main, ". seed=-1", "seed"),
     (report.main, "tables nowhere", "nowhere"),
+    (report.main, "html example --config-dir nowhere", "nowhere"),
     (render, "a.h5 task=Rope", "task=Rope"),
     (render, "task=Rope --output a.avi", "a.avi"),
     (render, "task=Rope targets.source=nowhere", "nowhere"),

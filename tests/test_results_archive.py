@@ -59,7 +59,7 @@ def test_a_run_in_files_and_archives_counts_once(folder: Path) -> None:
     begun = dataclasses.replace(read(path), status="running", evaluation={})
     path.unlink()
     synthetic.save(begun)
-    assert sorted(load(folder)["status"]) == ["finished", "finished", "stopped"]
+    assert sorted(load(folder)["status"]) == ["finished", "finished", "interrupted"]
 
 
 def test_packing_again_adds_what_is_new_and_is_reproducible(folder: Path) -> None:

@@ -208,11 +208,12 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
     for sql, named in (("select lr from runs", "lr"), ("select * from scores", "config"), ("", "empty")):
         assert named in told(["sql", sql, str(folder)], main)
-    sql = "select task, count(*) n, avg(seed) mean, null nil from runs group by task"
+    sql = "select task, count(*) n, sum(0.5) mean, null nil, date '2026-12-01' d from runs group by task"
     assert main(["sql", sql, str(folder)]) == 0
-    assert capsys.readouterr().out == "task  n  mean  nil\nRope  3     1\n"
+    assert capsys.readouterr().out == "task  n  mean  nil  d\nRope  3   1.5       2026-12-01\n"
     assert main(["sql", sql, str(folder), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [{"task": "Rope", "n": 3, "mean": 1.0, "nil": None}]
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row == {"task": "Rope", "n": 3, "mean": 1.5, "nil": None, "d": "2026-12-01"}
     assert str(folder / "no") in told(["sql", "select 1", str(folder / "no")], main)
     odd = f"PYTHONIOENCODING=ascii {sys.executable} -m plab results sql 'select chr(27)||chr(177) a' {folder}"
     assert subprocess.run(odd, shell=True, stdout=subprocess.PIPE).stdout == b"a\n\\xb1\n"

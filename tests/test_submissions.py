@@ -58,7 +58,7 @@ CARD = Card("Mine", ["A. Author", "B. Author"], "https://example.org/mine", 10**
 why = functools.partial(refusals.why, ResultsError)
 GOOD = dataclasses.asdict(CARD)
 CHECKSUM = "a" * 64
-ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 6))
 
 
 def entry(variant: str = "1", steps: int = 100, score: float = 0.5, **which: Any) -> Entry:
@@ -291,6 +291,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     judged(handed_in(folder, "liar", (real("1", 100, 1.0),)), [0.1], LIES)
     write(Submission(None, (real("1", 100, 0.5),)), folder / "recording.plabsub.zip")
     handed_in(folder, "foreign", (entry(),))
+    handed_in(folder, "short", (real("1", 100, 0.5, actions=ACTIONS[:9]),))
     (folder / "rubbish.plabsub.zip").write_bytes(b"rubbish")
     changed(handed_in(folder, "deep", (entry(),)), manifest_json=b"[" * 100_000)
     handed_in(folder, "believed", (real("1", 100, 0.5),))
@@ -322,9 +323,10 @@ def test_scores_are_means_of_whole_tables_within_budgets(leaders) -> None:
 
 def test_what_does_not_belong_is_left_out_with_a_reason(leaders, folder: Path) -> None:
     reasons = {"believed": "decoding a JSON", "deep": "decoding a JSON", "foreign": "target of Move-v1"}
-    reasons |= {"liar": "1 claim", "recording": "card", "rubbish": "zip"}
+    reasons |= {"liar": "1 claim", "recording": "card", "rubbish": "zip", "short": "shape"}
     for line, (name, reason) in zip(sorted(leaders[1]), reasons.items(), strict=True):
         assert line.startswith(str(folder / f"{name}.")) and reason in line
+    assert all(part in line for part in ("Move-v1", "[9, 6]", "[50, 6]"))
 
 
 def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def rows(cfg: Config, batch: int, steps: int, repeats: int, kinds: Sequence[str]
 
 def paper_row(cfg: Config, batch: int, steps: int, repeats: int) -> dict[str, object]:
     """Return the milliseconds per environment step of one environment of a task, next to the paper's."""
-    paper = paper_table("timing").set_index("task").loc[cfg.task.name]
+    paper = paper_table("timing").set_index("task").reindex([cfg.task.name]).iloc[0]
     measured = rows(cfg, batch, steps, repeats, PAPER_KINDS)
     found = {row["what"]: row["median_ms"] / batch for row in measured}
     out: dict[str, object] = {"task": cfg.task.name, "device": cfg.sim.device}

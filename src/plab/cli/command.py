@@ -16,6 +16,7 @@ import threading
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -307,7 +308,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str
     if form == "json":
         # JSON has no infinite numbers.
         shown = [[str(value) if value in (math.inf, -math.inf) else value for value in row] for row in cells]
-        print(json.dumps([dict(zip(columns, row, strict=True)) for row in shown], indent=1))
+        print(json.dumps([dict(zip(columns, row, strict=True)) for row in shown], indent=1, default=str))
     elif form == "csv":
         csv.writer(sys.stdout, lineterminator="\n").writerows([columns, *cells])
     else:
@@ -324,6 +325,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str
 def _cell(value: Any) -> Any:
     if value is None or value != value:
         return None
+    value = float(value) if isinstance(value, Decimal) else value
     return printable(value) if isinstance(value, str) else value
 
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from plab.cli.command import Parser, add_sources, command_line, folder, sources_and_words
+from plab.config.compose import check_overrides
 from plab.config.selection import select
 from plab.errors import print_error
 from plab.progress import show_progress
@@ -45,7 +46,11 @@ def main(argv: Sequence[str]) -> None:
     add("--no-pictures", dest="pictures", action="store_false", help=what)
     what = "key whose values are treated as separate methods, such as method.lr, folder or seed"
     add("--split", default="", metavar="KEY", help=what)
+    add(
+        "--config-dir", metavar="FOLDER", help="html: folder with your own tasks and modules, as for plab run"
+    )
     options = parser.parse_intermixed_args(argv)
+    check_overrides([], options.config_dir)
     options.sources, options.words = sources_and_words(options.sources)
     runs = collect(options.sources, select(options.words, NAMES), options.split)
     if runs.table.empty and options.what in ("notebooks", "html"):

@@ -28,10 +28,8 @@ from plab.config.selection import select
 from plab.errors import print_error, printable
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
-from plab.results.run_file import ResultsError
+from plab.results.run_file import NAMES, ResultsError
 from plab.results.run_table import query, scores
-
-SELECTABLE = ("task", "variant", "method", "seed", "status")
 
 
 @command_line
@@ -60,7 +58,7 @@ def _scores(argv: Sequence[str]) -> None:
     add_forms(parser)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
-    chosen = select(words, SELECTABLE)
+    chosen = select(words, (*NAMES, "status"))
     if chosen.choices.setdefault("status", ["finished"]) == ["all"]:
         del chosen.choices["status"]
     table, unreadable = scores(sources, chosen, options.keys, options.sort, descending=options.descending)
@@ -107,7 +105,7 @@ def _pack(argv: Sequence[str]) -> None:
     parser.add_argument("--digits", type=positive, help=what)
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
-    chosen = select(words, SELECTABLE)
+    chosen = select(words, NAMES)
     count, unreadable = pack(sources, options.output, chosen, options.digits)
     _report_skipped(unreadable)
     print(f"{options.output}: {count} run(s), {options.output.stat().st_size / 1e3:.1f} kB")

@@ -117,5 +117,5 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
             raise ArgumentError(f"no run has the key '{key}'")
 
 
-_OPEN = {"variant": r"random\d+", "seed": r"\d+", "status": "running|failed|stopped|finished"}
+_OPEN = {"variant": r"random\d+", "seed": r"\d+", "status": "running|failed|interrupted|finished"}
 """Additional allowed values."""

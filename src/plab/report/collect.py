@@ -21,6 +21,9 @@ from plab.results import Row, config_dict, rows
 from plab.results.run_file import NAMES
 from plab.results.run_table import Source, sources_of
 
+SCENE = ("task.bodies", "task.manipulators", "task.target")
+"""Sections of a task that are compared with those of plab's files."""
+
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that are columns of the table of runs."""
 
@@ -236,14 +239,17 @@ def _prefer_usual(found: Sequence[Row], split: str) -> tuple[list[Row], list[str
 
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a run that differ from plab's own files, by dotted key."""
-    variants = config["task"].get("variants") or {}
-    by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
-    expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
-    keys = [*expected, *(key for key, _ in leaves({"method": config["method"]}) if "method.name" in expected)]
+    task, variant = config["task"], str(config["variant"])
+    scene = _expected_scene(task["name"], variant, config["protocol"]["numbers"])
+    expected = scene | _expected(config["method"]["name"], task["name"], config["protocol"]["name"])
+    sections = [*(["method"] if "method.name" in expected else ()), *(SCENE if scene else ())]
+    keys = [*expected, *(key for name in sections for key, _ in leaves(lookup(config, name), name))]
+    # The values of random variants are sampled.
+    drawn = {} if variant in SUITE_VARIANTS else dict(leaves(task["variants"].get(variant, {}), "task"))
     # None where the run or plab's file has no such setting.
-    own = {key: lookup(config, key) for key in keys if key not in by_variant and key not in _IGNORED_KEYS}
+    own = {key: lookup(config, key) for key in keys if key not in drawn and key not in _IGNORED_KEYS}
     own = {key: None if value != value else value for key, value in own.items()}
-    own |= {key: value for key, value in leaves(config["task"].get("randomize"), "task.randomize") if value}
+    own |= {key: value for key, value in leaves(task.get("randomize"), "task.randomize") if value}
     return {key: value for key, value in own.items() if value != expected.get(key)}
 
 
@@ -263,9 +269,17 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     names = ["protocol", "sim", "seed_particles", *OBSERVATION_KEYS]
     names += ["method"] if "method" in chosen else []
     usual = dict(leaves({name: config[name] for name in names}))
-    own = shipped_file("task", task)
-    if usual["protocol.numbers"] == "release":
-        own = own | own.get("release", {})
-    # Bodies, manipulators, targets and variants may be changed freely.
-    usual |= {f"task.{key}": value for key, value in own.items() if not isinstance(value, dict)}
     return {key: value for key, value in usual.items() if key not in _IGNORED_KEYS}
+
+
+@functools.cache
+def _expected_scene(task: str, variant: str, numbers: str) -> dict[str, Any]:
+    """Return the settings of plab's file for a task and a variant, by dotted key; none for other tasks."""
+    from omegaconf import OmegaConf
+
+    own: Any = shipped_file("task", task)
+    own = OmegaConf.merge(own, own.get("release", {}) if numbers == "release" else {})
+    own = OmegaConf.merge(own, own.get("variants", {}).get(variant, {}))
+    whole: Any = OmegaConf.to_container(own)
+    kept = {name: own for name, own in whole.items() if f"task.{name}" in SCENE or not isinstance(own, dict)}
+    return dict(leaves(kept, "task")) if kept else {}

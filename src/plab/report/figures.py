@@ -329,8 +329,7 @@ def _errors(panel: Axes, own: pd.DataFrame, column: str, varied: str) -> None:
             panel.annotate(str(count), (x, y), xytext=(2, 2), **small)
         # Diverged runs have no error; they are drawn at the upper edge.
         above: Any = panel.get_xaxis_transform()
-        for x, count in rows.loc[rows["outcome"] != "stable", ["ms_per_step", varied]].itertuples(
-            index=False
-        ):
+        diverged = rows[rows["outcome"] != "stable"]
+        for x, count in zip(diverged["ms_per_step"], diverged[varied], strict=True):
             panel.plot(x, 1.0, "x", color=colour, transform=above, clip_on=False, markersize=4)
             panel.annotate(str(count), (x, 1.0), xytext=(0, 4), ha="center", xycoords=above, **small)

@@ -23,7 +23,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from plab.config.selection import leaves, lookup
 from plab.config.suite import shipped_file
-from plab.report.collect import Runs, changed_settings
+from plab.report.collect import SCENE, Runs, changed_settings
 from plab.report.methods import Method, method
 from plab.report.statistics import AXES, Rows, Series, band, load_series
 from plab.report.tables import compare, ordered_tasks, settings_note
@@ -175,7 +175,7 @@ def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _command(config: Mapping[str, Any]) -> str:
-    """Return the command that repeats a run."""
+    """Return the command that repeats a run, without changes of bodies, manipulators and targets."""
     drawn, method = config.get("seed_scene"), config["method"]
     variant = config["variant"] if drawn is None else f"random seed_scene={drawn}"
     # An experiment may rename the method of a file.
@@ -198,6 +198,8 @@ def _command(config: Mapping[str, Any]) -> str:
         own = leaves({"method": method})
         changed |= {key: value for key, value in own if value != {} and key[7:] not in ("name", "family")}
     for key, value in changed.items():
+        if key.startswith(SCENE):
+            continue
         text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
         known = lookup({"method": usual}, key)
         plus = "+" * (key.startswith("method.loss_") and bool(usual) and known != known)

@@ -19,8 +19,8 @@ from scipy import special
 from plab.config.families import SOLVED, known_family
 from plab.report.collect import Runs
 from plab.report.methods import method
-from plab.results import BUDGETS as SIMULATED
 from plab.results import read_curves
+from plab.results.run_file import BUDGETS as SIMULATED
 
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""

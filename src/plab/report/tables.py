@@ -434,7 +434,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
             where = f"benchmark, {row['device']}, {row['precision']}, batch {row['batch']}"
             for kind, column, name in _BENCHMARK:
-                measured.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
+                measured.append((task, kind, where, summarise([row[column]]), paper[name].get(task, nothing)))
     data, cells = [], []
     for task, kind, where, mine, theirs in measured:
         # The paper gives no standard deviation, so the interval is ours.

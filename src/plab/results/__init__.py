@@ -9,22 +9,11 @@ package imports pandas and DuckDB on demand, and neither torch nor Taichi, so th
 from plab.config.run import config_dict, config_hash
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
-from plab.results.run_file import (
-    BUDGETS,
-    SCHEMA_VERSION,
-    ResultsError,
-    RunBusyError,
-    RunResult,
-    read,
-    row_count,
-    write,
-)
+from plab.results.run_file import ResultsError, RunBusyError, RunResult, read, write
 from plab.results.run_table import Row, connect, load, read_curves, rows
 from plab.results.running import RunFile
 
 __all__ = [
-    "BUDGETS",
-    "SCHEMA_VERSION",
     "ResultsError",
     "Row",
     "RunBusyError",
@@ -38,7 +27,6 @@ __all__ = [
     "pack",
     "read",
     "read_curves",
-    "row_count",
     "rows",
     "unpack",
     "write",

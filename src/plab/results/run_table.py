@@ -48,6 +48,7 @@ from plab.results.run_file import (
     summary_of,
 )
 from plab.results.run_file import COLUMNS as ITERATION_COLUMNS
+from plab.results.running import held
 
 T = TypeVar("T")
 
@@ -89,11 +90,6 @@ class Row:
         return Path(self.values["path"])
 
 
-Index = dict[str, Any]
-"""By path below the folder: identity of the file, and its runs: for each the name in an archive ("." for a
-file) and the two parts of :class:`Row`."""
-
-
 def load(source: Source = "results", keys: Sequence[str] = (), *, index: bool = True) -> pd.DataFrame:
     """Load results into a table with one row per run.
 
@@ -107,12 +103,12 @@ def load(source: Source = "results", keys: Sequence[str] = (), *, index: bool = 
         index: Whether to use and update the index of the folder.
 
     Returns:
-        Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
-        best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
-        of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
-        ``score_best``, ``iou`` and ``loss`` are those of the final evaluation, NaN before it. ``score``
-        equals ``score_best``, or the score of the last iteration with ``protocol.score=last``: see
-        :attr:`RunResult.score`.
+        Columns task, variant, method, seed, status (``finished``, ``running``, ``interrupted``, ``failed``),
+        message, score, iou, loss, iterations, best_iteration, best_loss, seconds, started, device, precision,
+        batch, plab, git_commit, config_hash, path, the other scalars of the final evaluation, the seconds of
+        each phase (``seconds_optimise`` and so on), and ``keys``. ``score_best``, ``iou`` and ``loss`` are
+        those of the final evaluation, NaN before it. ``score`` equals ``score_best``, or the score of the
+        last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
 
     Raises:
         ResultsError: As for :func:`rows`, or if ``keys`` is a string, or no run has one of them.
@@ -154,6 +150,10 @@ def rows(
     if unreadable and not found and not any(root.is_dir() for root in roots):
         raise unreadable[0]
     found = _without_repetitions(found)
+    for values in (row.values for row in found if row.values["status"] != "finished"):
+        # After the file was written, the run may have been killed or resumed.
+        ended = "failed" if values["status"] == "failed" else "interrupted"
+        values["status"] = "running" if held(values["path"]) else ended
     if chosen is not None:
         require_possible(chosen, found)
         found = [row for row in found if chosen(row.values, row.config)]
@@ -242,7 +242,9 @@ def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
         if _final(path) in files:
             del files[path]
     place = _index_place(root)
-    known, kept = Index(), Index()
+    # By path: identity of the file, and for each run the name in an archive (or ".") and parts of the row.
+    known: dict[str, Any] = {}
+    kept: dict[str, Any] = {}
     # Missing or damaged, the index is built again.
     with suppress(OSError, EOFError, ValueError, zlib.error):
         known = dict(json.loads(gzip.decompress(place.read_bytes()))) if index else {}
@@ -394,23 +396,18 @@ def scores(
     *,
     descending: bool = False,
 ) -> tuple[pd.DataFrame, list[ResultsError]]:
-    """Return runs with their scores, one row each, and the errors of unreadable files.
+    """Return the chosen runs with their scores, one row each, and the errors of unreadable files.
 
     Args:
         source: Folder of results, archive, file or several of them.
         chosen: Selection of runs.
-        keys: Additional columns: columns of :func:`plab.results.load`, or dotted keys of the configuration.
+        keys: Additional columns: columns of :func:`load`, or dotted keys of the configuration.
         sort: Columns to sort by; default: the identity of a run. Runs without a value come last.
         descending: Sort in descending order.
 
-    Returns:
-        Columns task, variant, method, seed, protocol, targets (their source files, None for
-        plab's own), status, score and ``keys``; ``score`` as in :func:`plab.results.load`.
-
     Raises:
-        ArgumentError: If the selection cannot match any run, no run has one of ``keys``, or a column of
-            ``sort`` does not exist.
-        ResultsError: If ``source`` does not exist, or none of its files or archives can be read.
+        ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
+        ResultsError: As for :func:`rows`.
     """
     found, unreadable = rows(source, chosen)
     looked_up = {key: key for key in keys} | _SETTINGS

@@ -25,7 +25,8 @@ from plab.config.families import SOLVED, family
 from plab.errors import TRACEBACK, PlabError, describe_error, out_of_memory, print_error, traceback_wanted
 from plab.objective import chamfer_distance, earth_movers_distance
 from plab.progress import PLAIN_EVERY, Report, show_progress
-from plab.results import BUDGETS, ResultsError, RunFile, row_count
+from plab.results import ResultsError, RunFile
+from plab.results.run_file import BUDGETS, row_count
 
 if TYPE_CHECKING:
     from plab.problem import Episodes, Problem

@@ -13,10 +13,9 @@ from plab.config.selection import Selection, one_protocol
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.errors import printable
 from plab.plugins import pandas as pd
-from plab.results import ResultsError, Row, row_count
-from plab.results.run_file import NAMES, columns_of, opened, split_archive, summary_of
+from plab.results import ResultsError, Row
+from plab.results.run_file import NAMES, columns_of, opened, row_count, summary_of
 from plab.results.run_table import Source, rows
-from plab.results.running import held
 
 __all__ = ["NAMES", "STATES", "Survey", "survey"]
 
@@ -103,7 +102,8 @@ def survey(source: Source, chosen: Selection, *, missing: bool = False) -> Surve
     runs = {key: dict(zip(NAMES, key, strict=True)) | _MISSING for key in _expected(keys, chosen, missing)}
     others = 0
     for key, row in zip(keys, found, strict=True):
-        run, state = runs.get(key), _state(row)
+        run, status = runs.get(key), row.values["status"]
+        state = "done" if status == "finished" else status
         others += run is None or run["state"] != "missing"
         # Among several settings of the same run, the one with the best state counts.
         if run is not None and STATES.index(state) < STATES.index(run["state"]):
@@ -132,11 +132,6 @@ def _expected(present: Iterable[tuple[str, ...]], chosen: Selection, missing: bo
         return order.get(task, last), task, order.get(method, last), method, variant, len(seed), seed
 
     return sorted(keys, key=rank)
-
-
-def _state(row: Row) -> str:
-    state = {"finished": "done", "failed": "failed"}.get(row.values["status"], "interrupted")
-    return "running" if state != "done" and not split_archive(row.path) and held(row.path) else state
 
 
 def _described(row: Row, state: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 import numpy as np
 
 import plab
-from plab.config import Config
+from plab.config import Config, build_scene
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
 from plab.render import rollouts
@@ -114,7 +114,8 @@ def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configu
     """Compose the configurations of a submission.
 
     Raises:
-        SubmissionError: If the physics, a scene or a target differs from this plab's with the overrides.
+        SubmissionError: If the physics, a scene or a target differs from this plab's with the overrides, or a
+            plan does not fit its task.
         plab.config.ConfigError: If an override is invalid.
     """
     versions = f"({submission.plab}, this is {plab.__version__})"
@@ -125,19 +126,22 @@ def configs_of(submission: Submission, overrides: Sequence[str]) -> dict[Configu
         )
     found: dict[Configuration, Config] = {}
     for entry in submission.entries:
-        found[entry.configuration], known = _composed(entry.configuration, tuple(overrides))
+        found[entry.configuration], known, shape = _composed(entry.configuration, tuple(overrides))
         if entry.checksum != known:
             raise SubmissionError(
                 f"{submission.path}: the scene or target of {entry.configuration.name} differs from "
                 f"the one here: use the overrides that it was made with, or its plab {versions}"
             )
+        if entry.actions is not None and entry.actions.shape != shape:
+            given = f"the plan has shape {list(entry.actions.shape)}, but its task needs {list(shape)}"
+            raise SubmissionError(f"{submission.path}: {entry.configuration.name}: {given}")
     return found
 
 
 @functools.cache
-def _composed(one: Configuration, overrides: tuple[str, ...]) -> tuple[Config, str]:
+def _composed(one: Configuration, overrides: tuple[str, ...]) -> tuple[Config, str, tuple[int, int]]:
     cfg = one.config(overrides)
-    return cfg, checksum(cfg)
+    return cfg, checksum(cfg), (cfg.sim.horizon, build_scene(cfg).action_dim)
 
 
 # ---------------------------------------------------------------------------------------------- simulation
@@ -157,8 +161,7 @@ def play(
         Score of each episode's last state, and an empty string; after a divergence NaN and the reason.
 
     Raises:
-        SubmissionError: If a plan has a wrong shape, or the policy cannot be run, returns invalid actions, or
-            is not deterministic.
+        SubmissionError: If the policy cannot be run, returns invalid actions, or is not deterministic.
     """
     played: list[tuple[float, str]] = []
     for start in range(0, len(cfgs), _BATCH):
@@ -173,14 +176,11 @@ def play(
                 raise SubmissionError(f"{given}, but its task has {components}")
             if not np.array_equal(actions, actor(observations)):
                 raise SubmissionError(f"{name} is not deterministic: actions for one observation differ")
-        else:
-            plans, shape = actor[start : start + _BATCH], (batch.horizon, components)
-            for cfg, plan in zip(some, plans, strict=True):
-                if plan.shape != shape:
-                    given = f"the plan has shape {list(plan.shape)}, but its task needs {list(shape)}"
-                    raise SubmissionError(f"{cfg.task.name}-v{cfg.variant}: {given}")
         for t in range(batch.horizon):
-            actions = actor(observations) if callable(actor) else np.stack([plan[t] for plan in plans])
+            if callable(actor):
+                actions = actor(observations)
+            else:
+                actions = np.stack([plan[t] for plan in actor[start : start + _BATCH]])
             step = batch.step(actions, strict=False)
             observations = step.observation
         batch.close()

@@ -35,8 +35,8 @@ from plab.config.suite import choices
 from plab.errors import PlabError, print_error
 from plab.plugins import export_module_path
 from plab.problem import build_scenes
-from plab.results import ResultsError, RunFile, read, row_count
-from plab.results.run_file import PARTIAL_SUFFIX
+from plab.results import ResultsError, RunFile, read
+from plab.results.run_file import PARTIAL_SUFFIX, row_count
 from plab.results.running import held, lock_path
 from plab.runners.runner import Outcome, SimulatorCache, report
 from plab.scenes import Scene
