@@ -114,6 +114,11 @@ def test_seeds_and_options(vector) -> None:
     for key, value in {**refused, "bodies.ball.offset": [0.9, 0.0, 0.0]}.items():
         with pytest.raises(ValueError, match=key.rpartition(".")[2]):
             vector.reset(options={key: value})
+    # Separately loaded configurations differ in samples, and the first one has those of its seed.
+    batch = EpisodeBatch([load_config(["task=Move", *COARSE]) for _ in range(2)], randomize=RANGES)
+    resets = [batch.reset(seeds=seeds)[1]["randomized"]["gravity"] for seeds in (None, None, [0, 9], None)]
+    assert np.array_equal(resets[0][0], resets[2][0]) and np.array_equal(resets[1][0], resets[3][0])
+    assert len(np.unique(np.concatenate(resets), axis=0)) == 6
     # Values of a refused reset are not those of the next one.
     assert drawn(options={"yield_stress": 60})["yield_stress"].dtype == float
     assert [scene.yield_stress for scene in vector.batch.problem.simulator.scenes] == [60.0, 60.0]

@@ -108,7 +108,10 @@ def make_batch(
     steps = [] if max_episode_steps is None else [f"sim.horizon={max_episode_steps}"]
     lists = [(f"task={task}", f"variant={variant}", *overrides, *steps, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
-    return EpisodeBatch([made[entries] for entries in lists], **{"stages": True} | options)
+    batch = EpisodeBatch([made[entries] for entries in lists], **{"stages": True} | options)
+    # Sub-environments with different overrides have independent samples, too.
+    batch._seeds = [(cfg.seed, e) for e, cfg in enumerate(batch.configs)]
+    return batch
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
@@ -272,6 +275,7 @@ class EpisodeBatch:
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
         """Return configurations, sharing one object between equal ones, and their ranges."""
         require_configs(cfgs)
+        cfgs = [cfgs[cfgs.index(cfg)] for cfg in cfgs]
         unique = {id(cfg): cfg for cfg in cfgs}
         for key, cfg in unique.items():
             if self._randomize is not None:
@@ -398,7 +402,7 @@ class EpisodeBatch:
         rows = np.arange(self.size)[chosen].tolist()
         if seeds is not None:
             for e, seed in zip(rows, checked_seeds(seeds, len(rows)), strict=True):
-                self._seeds[e], self._episodes[e] = (seed,), -1
+                self._seeds[e], self._episodes[e] = (seed, 0), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
         drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}
