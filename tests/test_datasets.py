@@ -31,7 +31,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
     (folder / "cameras.yaml").write_text("top: {position: [0.5,2,0.5], target: [0.5,0,0.5], size: [8, 4]}")
     words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "task.floor_friction=2", *SEARCH]
-    words.append("method.loss_weights.sdf=3")
+    stage = "{recipe: bodies, bodies: {ball: {shape: sphere, center: [0.5, 0.5, 0.5], size: [0.1]}}}"
+    words += ["method.loss_weights.sdf=3", f"+task.stages=[{stage}]"]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder
