@@ -22,7 +22,7 @@ from plab.results import read
 from plab.runners import run_config
 from refusals import why
 from suite import DEVICE
-from toy_runner import COARSE_32
+from toy_runner import COARSE_32, COARSE_ROPE
 
 COARSE = [*COARSE_32, "sim.horizon=3", f"sim.device={DEVICE}"]
 NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
@@ -191,6 +191,8 @@ def test_refusals() -> None:
         assert named in message and "task.randomize" in message
     with pytest.raises(ConfigError, match="stability"):
         EpisodeBatch([load_config(["task=Move", *COARSE])], randomize={"youngs_modulus": [1e3, 1e9]})
+    with pytest.raises(ConfigError, match=r"rope\.yaw"):
+        EpisodeBatch([load_config(COARSE_ROPE)], randomize={"bodies": {"rope": {"yaw": [0.0, 3.0]}}})
     assert load_config(["task=Move"]).hash == load_config(["task=Move", "+task.randomize={}"]).hash
 
 

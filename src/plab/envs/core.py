@@ -305,10 +305,7 @@ class EpisodeBatch:
         self._steps = np.full(self.size, self.horizon)
         self._over = np.zeros(self.size, bool)
         # Environments with the same configuration have independent samples.
-        ids = [id(cfg) for cfg in self.configs]
-        self._seeds: list[tuple[int, ...]] = [
-            (cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)
-        ]
+        self._seeds = [(cfg.seed, self.configs[:e].count(cfg)) for e, cfg in enumerate(self.configs)]
         self._episodes = np.full(self.size, -1)
         self._simulator.reset()
         self._observe_starts()
