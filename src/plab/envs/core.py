@@ -149,9 +149,7 @@ class Transition:
     @property
     def cut_off(self) -> np.ndarray:
         """Mask of the episodes that have reached the horizon or diverged, shape [batch]."""
-        broken = np.zeros_like(self.truncated)
-        broken[list(self.failures)] = True
-        return self.truncated | broken
+        return self.truncated | np.isin(np.arange(len(self.truncated)), list(self.failures))
 
 
 @dataclass(frozen=True)
@@ -329,9 +327,7 @@ class EpisodeBatch:
     @property
     def over(self) -> np.ndarray:
         """Mask of the ended episodes, which must be reset, shape [batch]."""
-        over = self._over.copy()
-        over[list(self.failures)] = True
-        return over
+        return self._over | np.isin(np.arange(self.size), list(self.failures))
 
     @property
     def _simulator(self) -> Simulator:

@@ -21,11 +21,11 @@ from plab.config.randomization import (
     SCENES,
     Values,
     checked,
-    draw,
     extremes,
     present_value,
     ranges_of,
     turned,
+    uniform,
     with_values,
     yaws,
 )
@@ -189,7 +189,8 @@ class EpisodeRandomizer:
         cfg = self._cfgs[e]
         pool = self._pools.get(id(cfg), ())
         rng = np.random.default_rng(list(seed))
-        values = draw(self._bounds[id(cfg)], rng)
+        bounds = self._bounds[id(cfg)].items()
+        values: Values = {key: uniform(low, high, rng).tolist() for key, (low, high) in bounds}
         if pool:
             values[SCENE] = int(rng.integers(len(pool)))
         for key, value in given.items():
