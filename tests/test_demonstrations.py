@@ -25,7 +25,6 @@ from toy_runner import COARSE_32
 TASKS = suite_tasks()
 GEOMETRIC = ("Move", "Rope", "TripleMove")
 MOVE_NAMES = ["0_x", "0_y", "0_z", "1_x", "1_y", "1_z"]
-COARSE = (*COARSE_32, "progress=false")
 
 
 def config(task: str, variant: str, *overrides: str) -> Config:
@@ -84,13 +83,13 @@ def test_recording_replaces_one_demonstration_and_keeps_the_rest(records):
 def test_a_scripted_demonstration_reaches_its_target_and_rest_does_not(device):
     random = ("TripleMove", "random", "seed_scene=1002")
     for least, *words in ((0.95, "RollingPin", "1"), (0.95, "RollingPin", "4"), (0.5, *random)):
-        cfg = config(*words, *COARSE, f"sim.device={device}")
+        cfg = config(*words, *COARSE_32, f"sim.device={device}")
         (item,) = replay([cfg], [known_actions(cfg)])
         assert item.scores.score > least and item.idle.score < 0.5
 
 
 def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records):
-    coarse = [*COARSE[:-1], f"sim.device={device}"]
+    coarse = [*COARSE_32, f"sim.device={device}"]
     better = load_actions("Move", "1")
     results = records / "results"
     given = ((better, 0.5, "finished"), (-better, 0.4, "finished"), (-better, 0.9, "stopped"))
