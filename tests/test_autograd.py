@@ -73,7 +73,7 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
     # Integers are converted, so that losses and states are not cut to integers.
     ones = torch.ones(actions.shape, dtype=torch.int64)
     assert torch.equal(rollout(problem, ones), rollout(problem, ones.double()))
-    assert simulate(problem.simulator, ones).x.dtype == torch.float64
+    assert simulate(problem.simulator, ones, material=torch.tensor(300.0)).x.dtype == torch.float64
     compiled = torch.compile(lambda tried: rollout(problem, tried) + 0, backend="eager")
     assert torch.equal(compiled(actions), rollout(problem, actions.detach().numpy()))
     with pytest.raises(TypeError, match="complex"):

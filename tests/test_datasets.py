@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import plab
 from plab.cli.dataset import main
 from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
+from plab.envs.single import PlabEnv
 from plab.plugins import load_object
 from plab.runners import run_config
 from plab.runners.identify import IdentifyRunner, _value
@@ -31,7 +31,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
     (folder / "cameras.yaml").write_text("top: {position: [0.5,2,0.5], target: [0.5,0,0.5], size: [8, 4]}")
     words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "task.floor_friction=2", *SEARCH]
-    words.append("method.loss_weights.sdf=3")
+    stage = "{recipe: bodies, bodies: {ball: {shape: sphere, center: [0.5, 0.5, 0.5], size: [0.1]}}}"
+    words += ["method.loss_weights.sdf=3", f"+task.stages=[{stage}]"]
     seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
     assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
     return folder
@@ -40,9 +41,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_episode_is_what_its_environment_gives(written: Path) -> None:
     metadata = metadata_of(written / "plab/Move-v0")
     assert (metadata["total_episodes"], metadata["total_steps"]) == (3, 150)
-    kwargs = json.loads(metadata["env_spec"])["kwargs"]
-    env = plab.make("Move", 1, **{key: kwargs[key] for key in ("observe", "cameras")}, overrides=[
-        *kwargs["overrides"], "variant=random"])  # fmt: skip
+    env = PlabEnv(**json.loads(metadata["env_spec"])["kwargs"])
     first, *others = read_episodes(written / "plab/Move-v0")
     variants = [one.attributes["variant"] for one in (first, *others)]
     assert variants == ["random1000", "random1001", "random1003"]
@@ -76,9 +75,7 @@ def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> 
     words = ["task=Move", "variant=random", "seed_scene=1000", *SEARCH[:3], "method.iterations=1,2"]
     drawn = [f"+task.randomize.{one}" for one in ranges]
     assert main([*words, *drawn, f"results_dir={tmp_path}", *COARSE, "--output", str(tmp_path)]) == 0
-    kwargs = json.loads(metadata_of(tmp_path / "plab/Move-v0")["env_spec"])["kwargs"]
-    words = [*kwargs["overrides"], "variant=random"]
-    env = plab.make("Move", 1, overrides=words, randomize=kwargs["randomize"])
+    env = PlabEnv(**json.loads(metadata_of(tmp_path / "plab/Move-v0")["env_spec"])["kwargs"])
     episodes = list(read_episodes(tmp_path / "plab/Move-v0"))
     for one in episodes:
         values = {key: of_states[0] for key, of_states in one.infos["randomized"].items()}
@@ -88,10 +85,9 @@ def test_sampled_values_are_written_and_set_by_reset_options(tmp_path: Path) -> 
 
 
 def cloned(folder: Path, *words: str) -> Config:
-    place = f"method.dataset={folder}/plab/Move-v0"
+    place = ["method=bc", f"method.dataset={folder}/plab/Move-v0"]
     small = ["method.episodes=18", "method.evaluate_every=9", "method.hidden=[8]", "method.shift=0.1"]
-    scene = ["task=Move", "variant=random", "seed_scene=9000"]
-    return load_config([*scene, "method=bc", place, *COARSE, *small, *words])
+    return load_config(["task=Move", "variant=random", "seed_scene=9000", *place, *COARSE, *small, *words])
 
 
 def test_the_nearest_neighbour_repeats_the_actions_of_a_dataset() -> None:

@@ -22,7 +22,7 @@ from plab.results import read
 from plab.runners import run_config
 from refusals import why
 from suite import DEVICE
-from toy_runner import COARSE_32
+from toy_runner import COARSE_32, COARSE_ROPE
 
 COARSE = [*COARSE_32, "sim.horizon=3", f"sim.device={DEVICE}"]
 NEAR = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
@@ -59,8 +59,7 @@ def test_a_row_of_a_batch_is_an_environment_alone(vector) -> None:
     first, again = episode(vector, 2, seed=5), episode(vector, 2)
     alone = plab.make("Move", overrides=[*COARSE, NEAR, "observe_target=1"], randomize=RANGES)
     for known in (first, again):
-        how = {"seed": 6} if known is first else {}
-        observation, info = alone.reset(**how)
+        observation, info = alone.reset(seed=6 if known is first else None)
         np.testing.assert_array_equal(known[0][0][1], observation)
         assert known[0][1]["randomized"].keys() >= info["randomized"].keys()
         for key, value in info["randomized"].items():
@@ -114,13 +113,17 @@ def test_seeds_and_options(vector) -> None:
     for key, value in {**refused, "bodies.ball.offset": [0.9, 0.0, 0.0]}.items():
         with pytest.raises(ValueError, match=key.rpartition(".")[2]):
             vector.reset(options={key: value})
+    # Separately loaded configurations differ in samples, and the first one has those of its seed.
+    batch = EpisodeBatch([load_config(["task=Move", *COARSE]) for _ in range(2)], randomize=RANGES)
+    resets = [batch.reset(seeds=seeds)[1]["randomized"]["gravity"] for seeds in (None, None, [0, 9], None)]
+    assert np.array_equal(resets[0][0], resets[2][0]) and np.array_equal(resets[1][0], resets[3][0])
+    assert len(np.unique(np.concatenate(resets), axis=0)) == 6
     # Values of a refused reset are not those of the next one.
     assert drawn(options={"yield_stress": 60})["yield_stress"].dtype == float
     assert [scene.yield_stress for scene in vector.batch.problem.simulator.scenes] == [60.0, 60.0]
 
 
 def test_what_is_drawn_is_what_is_simulated(vector) -> None:
-    """A randomised episode is bitwise identical on the CPU to one of a task with the same numbers."""
     options = {"yield_stress": 30.0, "gravity": [0.0, -28.0, 0.0], "observation_noise": 0.0}
     options |= {"bodies.ball.offset": [0.01, 0.0, 0.0], "bodies.ball.yaw": 0.0, "floor_friction": 0.5}
     options |= {"manipulators.left.offset": [-0.01, 0.0, 0.0], "manipulators.left.friction": 0.3}
@@ -135,8 +138,7 @@ def test_what_is_drawn_is_what_is_simulated(vector) -> None:
     task.target["bodies"]["ball"]["center"] = [0.65, 0.47, 0.72]
     batch = EpisodeBatch([replace(cfg, task=task)] * 2)
     observation, info = batch.reset()
-    tolerance = {"rtol": 1e-5, "atol": 1e-6}
-    np.testing.assert_allclose(drawn[0][0], observation, **tolerance)
+    np.testing.assert_allclose(drawn[0][0], observation, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(drawn[0][1]["loss"], info["loss"], rtol=1e-5)
     np.testing.assert_allclose(batch.problem.initial_mass, vector.batch.problem.initial_mass, atol=1e-6)
     for t, action in enumerate(np.random.default_rng(0).uniform(-1, 1, (3, 2, 6))):
@@ -186,6 +188,8 @@ def test_refusals() -> None:
         assert named in message and "task.randomize" in message
     with pytest.raises(ConfigError, match="stability"):
         EpisodeBatch([load_config(["task=Move", *COARSE])], randomize={"youngs_modulus": [1e3, 1e9]})
+    with pytest.raises(ConfigError, match=r"rope\.yaw"):
+        EpisodeBatch([load_config(COARSE_ROPE)], randomize={"bodies": {"rope": {"yaw": [0.0, 3.0]}}})
     assert load_config(["task=Move"]).hash == load_config(["task=Move", "+task.randomize={}"]).hash
 
 

@@ -347,8 +347,10 @@ def test_vec_env_answers_what_it_can(vector: PlabVectorEnv) -> None:
 
 def test_configurations_of_a_batch() -> None:
     own = [["variant=3"], ["variant=random", "seed_scene=5"], ["variant=random", "seed_scene=6"]]
-    batch = core.make_batch("Move", "1", num_envs=3, overrides=COARSE, overrides_per_env=own)
+    options = {"overrides": COARSE, "overrides_per_env": own, "randomize": {"floor_friction": [0.1, 1.0]}}
+    batch = core.make_batch("Move", "1", num_envs=3, **options)
     assert [cfg.variant for cfg in batch.configs] == ["3", "random5", "random6"]
+    assert len(set(batch.reset()[1]["randomized"]["floor_friction"])) == 3
     wrong = [
         ({"overrides": "sim.device=cuda"}, "overrides"),
         ({"overrides": ["task=Rope"]}, "task=Rope"),

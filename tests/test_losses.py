@@ -124,8 +124,9 @@ def test_a_wrong_measure_or_gradient_is_noticed(device: str) -> None:
         def measure(self, e, x, v):
             return v
 
-    with pytest.raises(Exception, match="Tensor"):
-        check_gradient(Vector(), with_tools("Sphere"), device=device)
+    for wrong, named in ((Vector(), "Tensor"), ("density", "not 'density'")):
+        with pytest.raises(Exception, match=named):
+            check_gradient(wrong, with_tools("Sphere"), device=device)
     errors = check_gradient(Wrong(), with_tools("Sphere"), device=device, directions=1)
     assert errors["x"] == pytest.approx(0.5) and max(errors["v"], errors["poses"]) < 1e-6
 

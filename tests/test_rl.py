@@ -279,6 +279,7 @@ def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
     lost = cfg.path.with_suffix(".replay")
     with stopped_at(20, *STEPS["tqc"]):
         run_config(cfg, CACHE)
+    assert next(iter(CACHE._kept.values()))[0]._seeds == [(0, 0), (0, 1)]
     lost.unlink()
     with pytest.raises(ResultsError, match=rf"{re.escape(str(lost))}.*force=true"):
         run_config(cfg, CACHE)

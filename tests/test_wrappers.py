@@ -159,6 +159,7 @@ def test_goals_agree_with_hindsight() -> None:
     env = GoalEnv(plab.make("Move", overrides=COARSE, observe=names, randomize=ranges))
     first, _ = env.reset(seed=0)
     assert env.observation_space.contains(first) and first["achieved_goal"].sum() == pytest.approx(1.0)
+    assert env.spec.additional_wrappers[-1].kwargs == {}
     seen, reward, *_ = env.step(np.ones(6))
     pairs = (np.stack([seen[name]] * 2) for name in ("achieved_goal", "desired_goal"))
     assert env.compute_reward(*pairs, {}) == pytest.approx([reward] * 2) and -1.0 <= reward < 0.0

@@ -245,8 +245,10 @@ def _env_spec(cfg: Config, observe: str | list[str], cameras: Any, config_dir: s
     usual = load_config([f"task={cfg.task.name}", f"variant={variant}", *words], config_dir)
     values, loss = dict(leaves(asdict(usual))), ("method.loss_weights.", "method.loss_terms.")
     written = "task.", "sim.", "protocol.", "targets.", "seed_particles", *OBSERVATION_KEYS
-    task = replace(cfg.task, variants=usual.task.variants, randomize=usual.task.randomize)
-    for key, value in leaves(asdict(replace(cfg, task=task))):
+    # Datasets have no stages, and other machines no GPU.
+    task = replace(cfg.task, variants=usual.task.variants, randomize=usual.task.randomize, stages=[])
+    sim = replace(cfg.sim, device=usual.sim.device)
+    for key, value in leaves(asdict(replace(cfg, task=task, sim=sim))):
         # The usual loss depends on other overrides.
         if key.startswith(loss) or (value != values.get(key) and key.startswith(written)):
             # A variant would replace other overrides of the task.

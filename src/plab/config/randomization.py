@@ -110,12 +110,8 @@ def _entries(node: Any) -> dict[str, Any]:
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 
-def draw(bounds: Mapping[str, tuple[Any, Any]], rng: np.random.Generator) -> Values:
-    """Sample a value for each range, uniformly per entry."""
-    return {key: _uniform(low, high, rng).tolist() for key, (low, high) in bounds.items()}
-
-
-def _uniform(low: Any, high: Any, rng: np.random.Generator) -> Any:
+def uniform(low: Any, high: Any, rng: np.random.Generator) -> Any:
+    """Sample a number or numbers uniformly per entry."""
     return np.asarray(low) + rng.random(np.shape(low)) * np.subtract(high, low)
 
 
@@ -236,7 +232,7 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
 
 
 def _rounded(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
-    drawn = np.round(_uniform(bounds.low, bounds.high, rng), DECIMALS)
+    drawn = np.round(uniform(bounds.low, bounds.high, rng), DECIMALS)
     return drawn.clip(bounds.low, bounds.high).tolist()
 
 

@@ -123,7 +123,10 @@ def simulate(
     """
     if unknown := set(initial) - set(_FIELDS):
         raise TypeError(f"'{min(unknown)}' is not a part of a state: {', '.join(_FIELDS)}")
-    parts = [floating(actions, simulator), material, *(initial.get(name) for name in _FIELDS)]
+    given = [material, *(initial.get(name) for name in _FIELDS)]
+    # Arrays are accepted, too, and a number as the first parameter of the material.
+    tensors = [part if part is None else torch.atleast_1d(torch.as_tensor(part)) for part in given]
+    parts = [floating(actions, simulator), *tensors]
     gradient = torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in parts)
     return States(*_States.apply(simulator, every_step, mass, gradient, *parts))
 

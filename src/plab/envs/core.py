@@ -108,7 +108,10 @@ def make_batch(
     steps = [] if max_episode_steps is None else [f"sim.horizon={max_episode_steps}"]
     lists = [(f"task={task}", f"variant={variant}", *overrides, *steps, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
-    return EpisodeBatch([made[entries] for entries in lists], **{"stages": True} | options)
+    batch = EpisodeBatch([made[entries] for entries in lists], **{"stages": True} | options)
+    # Sub-environments with different overrides have independent samples, too.
+    batch._seeds = [(cfg.seed, e) for e, cfg in enumerate(batch.configs)]
+    return batch
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
@@ -146,9 +149,7 @@ class Transition:
     @property
     def cut_off(self) -> np.ndarray:
         """Mask of the episodes that have reached the horizon or diverged, shape [batch]."""
-        broken = np.zeros_like(self.truncated)
-        broken[list(self.failures)] = True
-        return self.truncated | broken
+        return self.truncated | np.isin(np.arange(len(self.truncated)), list(self.failures))
 
 
 @dataclass(frozen=True)
@@ -272,6 +273,7 @@ class EpisodeBatch:
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
         """Return configurations, sharing one object between equal ones, and their ranges."""
         require_configs(cfgs)
+        cfgs = [cfgs[cfgs.index(cfg)] for cfg in cfgs]
         unique = {id(cfg): cfg for cfg in cfgs}
         for key, cfg in unique.items():
             if self._randomize is not None:
@@ -301,10 +303,7 @@ class EpisodeBatch:
         self._steps = np.full(self.size, self.horizon)
         self._over = np.zeros(self.size, bool)
         # Environments with the same configuration have independent samples.
-        ids = [id(cfg) for cfg in self.configs]
-        self._seeds: list[tuple[int, ...]] = [
-            (cfg.seed, ids[:e].count(ids[e])) for e, cfg in enumerate(self.configs)
-        ]
+        self._seeds = [(cfg.seed, self.configs[:e].count(cfg)) for e, cfg in enumerate(self.configs)]
         self._episodes = np.full(self.size, -1)
         self._simulator.reset()
         self._observe_starts()
@@ -328,9 +327,7 @@ class EpisodeBatch:
     @property
     def over(self) -> np.ndarray:
         """Mask of the ended episodes, which must be reset, shape [batch]."""
-        over = self._over.copy()
-        over[list(self.failures)] = True
-        return over
+        return self._over | np.isin(np.arange(self.size), list(self.failures))
 
     @property
     def _simulator(self) -> Simulator:
@@ -398,7 +395,7 @@ class EpisodeBatch:
         rows = np.arange(self.size)[chosen].tolist()
         if seeds is not None:
             for e, seed in zip(rows, checked_seeds(seeds, len(rows)), strict=True):
-                self._seeds[e], self._episodes[e] = (seed,), -1
+                self._seeds[e], self._episodes[e] = (seed, 0), -1
         numbers = self._episodes[rows] + 1 if episode is None else np.full(len(rows), episode)
         entropy = {e: (*self._seeds[e], int(number)) for e, number in zip(rows, numbers, strict=True)}
         drawn = {e: self.randomizer.sample(e, own, options or {}) for e, own in entropy.items()}

@@ -7,13 +7,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Dict
+from gymnasium.utils import RecordConstructorArgs
 
 from plab.errors import ArgumentError
 
 _NAMES = {"observation": "state", "achieved_goal": "mass", "desired_goal": "target_mass"}
 
 
-class GoalEnv(gymnasium.ObservationWrapper[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray]]):
+class GoalEnv(gymnasium.ObservationWrapper[Any, np.ndarray, Any], RecordConstructorArgs):
     """Environment with the observations ``observation``, ``achieved_goal`` and ``desired_goal``.
 
     These are the state, and the current and target mass distributions on a coarse grid. Rewards are
@@ -23,6 +24,7 @@ class GoalEnv(gymnasium.ObservationWrapper[dict[str, np.ndarray], np.ndarray, di
     def __init__(self, env: gymnasium.Env[Any, np.ndarray]) -> None:
         """Wrap an environment that observes ``state``, ``mass`` and ``target_mass``; raise ValueError for
         other observations."""
+        RecordConstructorArgs.__init__(self)
         super().__init__(env)
         space = env.observation_space
         if not isinstance(space, Dict) or not set(_NAMES.values()) <= set(space.spaces):

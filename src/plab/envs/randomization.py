@@ -21,11 +21,11 @@ from plab.config.randomization import (
     SCENES,
     Values,
     checked,
-    draw,
     extremes,
     present_value,
     ranges_of,
     turned,
+    uniform,
     with_values,
     yaws,
 )
@@ -34,6 +34,7 @@ from plab.objective import spread_mass, target_observation
 from plab.problem import Problem, drawn_scenes, make_targets, target_distance
 from plab.scenes import Body, Manipulator, Scene, sample_particles
 from plab.sim import Simulator
+from plab.sim.batch import checked_positions
 from plab.targets import RECIPES, build_target
 from plab.targets.recipes import TensorRecipe
 
@@ -108,9 +109,11 @@ class EpisodeRandomizer:
         self._placed: list[Any] = [(base, {}, _places(base.scene)) for base in self._bases]
         self._targets: list[tuple[_Base, Values]] = [(base, {}) for base in self._bases]
         self.scenes = [base.scene for pool in self._pools.values() for base in pool]
-        for cfg in unique.values():
-            with located("task.randomize"):
-                self.scenes += [self._checked(one) for one in (extremes(cfg) if cfg.task.randomize else [])]
+        for base in {id(base.cfg): base for base in self._bases}.values():
+            for one in extremes(base.cfg) if base.cfg.task.randomize else []:
+                with located("task.randomize"):
+                    self.scenes.append(self._checked(one))
+                    self._require_room(base, self.scenes[-1])
 
     @property
     def stages(self) -> np.ndarray:
@@ -186,7 +189,8 @@ class EpisodeRandomizer:
         cfg = self._cfgs[e]
         pool = self._pools.get(id(cfg), ())
         rng = np.random.default_rng(list(seed))
-        values = draw(self._bounds[id(cfg)], rng)
+        bounds = self._bounds[id(cfg)].items()
+        values: Values = {key: uniform(low, high, rng).tolist() for key, (low, high) in bounds}
         if pool:
             values[SCENE] = int(rng.integers(len(pool)))
         for key, value in given.items():
@@ -198,6 +202,13 @@ class EpisodeRandomizer:
                 f"options['scene']: {values[SCENE]} must be below task.randomize.scenes={len(pool)}"
             )
         return values | ({STAGE: 0} if self.last_stage else {})
+
+    def _require_room(self, base: _Base, scene: Scene) -> None:
+        """Raise ValueError if a body leaves the grid at an angle within its range."""
+        for key, (low, high) in self._bounds[id(base.cfg)].items():
+            for yaw in np.linspace(low, high, 33) if key.endswith(".yaw") else ():
+                x = _moved(base, {key.split(".")[1]: yaw}, _places(scene))
+                checked_positions(x, scene, f"{key}={yaw:.3g}")
 
     @staticmethod
     def _checked(cfg: Config) -> Scene:
@@ -215,8 +226,7 @@ class EpisodeRandomizer:
         with located("randomize", ArgumentError):
             mass = build_target(scene, cfg.task.target)
             same = np.array_equal(mass, base.configured_mass)
-            target = base.targets[-1] if same else (mass, target_distance(mass))
-        return target
+            return base.targets[-1] if same else (mass, target_distance(mass))
 
 
 def _applied(value: Any, before: Any, after: Any) -> Any:

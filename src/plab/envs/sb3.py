@@ -30,7 +30,7 @@ def make_sb3(env_id: str, num_envs: int = 1, *, render_mode: str | None = None, 
             multiple observations, the policy must accept dictionaries, as ``MultiInputPolicy`` does.
 
     Raises:
-        ValueError: If no environment of plab has this id.
+        ValueError: If no environment of plab has this id, or the render mode does not exist.
     """
     spec = gymnasium.registry.get(env_id)
     if spec is None or spec.entry_point != ENTRY_POINT:
@@ -56,16 +56,8 @@ class PlabVecEnv(VecEnv):
     def __init__(
         self, batch: EpisodeBatch, *, render_mode: str | None = None, spec: EnvSpec | None = None
     ) -> None:
-        """Wrap a batch of episodes.
-
-        Args:
-            batch: The episodes; closed with the environment.
-            render_mode: ``rgb_array``, or None for no pictures.
-            spec: Gymnasium's specification of one sub-environment.
-
-        Raises:
-            ValueError: If the render mode does not exist.
-        """
+        """Wrap a batch of episodes, which is closed with the environment; ``render_mode`` and errors are as
+        in :func:`make_sb3`."""
         self.batch = batch
         self.spec = copy.copy(spec)
         if self.spec is not None:

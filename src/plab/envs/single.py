@@ -29,14 +29,8 @@ class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     def __init__(
         self, task: str, variant: str = "1", *, render_mode: str | None = None, **options: Any
     ) -> None:
-        """Build the environment.
-
-        Args:
-            task: Name of the task.
-            variant: Name of the variant.
-            render_mode: ``rgb_array``, or None for no pictures.
-            **options: Arguments of :func:`plab.envs.core.make_batch`, whose errors apply.
-        """
+        """Build the environment. ``render_mode`` is ``rgb_array``, or None for no pictures; other arguments
+        and errors are those of :func:`plab.envs.core.make_batch`."""
         if "num_envs" in options:
             raise ArgumentError("num_envs is an argument of make_vec, of plab and of gymnasium, not of make")
         self._arguments = {"task": task, "variant": variant, "render_mode": render_mode, **options}

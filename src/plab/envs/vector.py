@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -26,10 +26,6 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         batch: The episodes, with their scenes, targets and simulator.
     """
 
-    metadata: ClassVar[dict[str, Any]] = METADATA | {  # type: ignore[misc]
-        "autoreset_mode": AutoresetMode.NEXT_STEP
-    }
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -43,21 +39,18 @@ class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Build the environments.
 
         Args:
-            num_envs: Number of sub-environments.
-            task: Name of the task.
-            variant: Name of the variant.
             render_mode: ``rgb_array``, or None for no pictures.
             autoreset_mode: A member of Gymnasium's ``AutoresetMode`` or its value: ``NextStep`` resets in the
                 step after the end of an episode, which ignores the action; ``SameStep`` in the last step of
                 the episode, with the final observation in ``infos["final_obs"]``; ``Disabled`` requires
                 :meth:`reset` with ``options={"reset_mask": ...}``.
-            **options: Arguments of :func:`plab.envs.core.make_batch`, whose errors apply.
+            **options: Like the others, arguments of :func:`plab.envs.core.make_batch`, whose errors apply.
         """
         own = {"num_envs": num_envs, "task": task, "variant": variant, "render_mode": render_mode}
         self._arguments = {**own, "autoreset_mode": autoreset_mode, **options}
         self.render_mode = check_render_mode(render_mode)
         self._mode = AutoresetMode(autoreset_mode)
-        self.metadata = METADATA | {"autoreset_mode": self._mode}  # type: ignore[misc]
+        self.metadata = METADATA | {"autoreset_mode": self._mode}
         self.batch = make_batch(task, variant, num_envs=num_envs, **options)
         self.num_envs = num_envs
         self.single_observation_space = self.batch.observation_space

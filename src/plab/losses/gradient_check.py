@@ -40,8 +40,10 @@ def check_gradient(
         ``poses``. Relative to the largest directional derivative; 0 if the term does not depend on the part.
 
     Raises:
-        ValueError: If the measure does not depend on the state.
+        ValueError: If ``term`` is not a term, or its measure does not depend on the state.
     """
+    if not isinstance(term, Term):
+        raise ArgumentError(f"check_gradient takes a term of plab.losses.term, not {term!r}")
     term.weight = term.weight or 1.0
     simulator = Simulator(scenes, terms=(term,), precision="float64", device=device)
     return gradient_errors(simulator, term, directions=directions, seed=seed)

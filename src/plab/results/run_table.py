@@ -405,6 +405,10 @@ def scores(
         sort: Columns to sort by; default: the identity of a run. Runs without a value come last.
         descending: Sort in descending order.
 
+    Returns:
+        Columns task, variant, method, seed, protocol, targets (their source files, None for plab's own),
+        status, score and ``keys``.
+
     Raises:
         ArgumentError: If no run has one of ``keys``, or a column of ``sort`` does not exist.
         ResultsError: As for :func:`rows`.

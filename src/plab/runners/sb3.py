@@ -97,6 +97,8 @@ class Sb3Runner(PolicyRunner):
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
+        # Of the library's seeds, those of neighbouring runs overlap.
+        self._envs._reset_seeds()
 
     @property
     def steps(self) -> int:
@@ -136,6 +138,7 @@ class Sb3Runner(PolicyRunner):
         self.model = self._kind.model.load(io.BytesIO(state["model"].tobytes()), self._env, self._device)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self._envs.next_episode = self.episodes // self.method.num_envs
+        self._envs._reset_seeds()
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])

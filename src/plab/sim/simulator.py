@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 from plab.plugins import torch
-from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
+from plab.scenes import CONTACTS, Scene, SceneError, is_whole, sample_particles
 from plab.sim.batch import (
     checked_positions,
     initial_poses,
@@ -445,6 +445,8 @@ class Simulator:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
         """
         self._require_runtime()
+        if not is_whole(stride):
+            raise ArgumentError(f"stride must be a whole number of at least 1, not {stride}")
         return self._observe(self._particles.current, 0, stride, like)
 
     def _observe(
