@@ -16,8 +16,7 @@ from plab.sim import shapes
 
 
 def test_the_volume_of_a_sphere_is_that_of_its_formula():
-    body = make_body("sphere", (0.5, 0.5, 0.5), (0.2,), 100)
-    assert body.volume == pytest.approx(4 / 3 * math.pi * 0.2**3)
+    assert make_body("sphere", (0.5,) * 3, (0.2,), 100).volume == pytest.approx(4 / 3 * math.pi * 0.2**3)
 
 
 def test_the_time_step_that_is_advised_is_accepted():

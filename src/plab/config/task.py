@@ -92,15 +92,6 @@ class ManipulatorConfig(ranges.Section):
     gap: float | None = field(default=None, metadata=ranges.POSITIVE)
     minimal_gap: float | None = field(default=None, metadata=ranges.POSITIVE)
 
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for errors that :meth:`plab.scenes.Scene.validate` does not check."""
-        super().check(path)
-        for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
-            if not low <= at <= high:
-                raise ConfigError(
-                    f"{path}.position: {axis} = {at:g} is outside its bounds {low:g} .. {high:g}"
-                )
-
     def build(self) -> Manipulator:
         """Return the scene's manipulator."""
         values: dict[str, Any] = {
