@@ -254,7 +254,7 @@ def test_mistakes_in_a_model_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong, named in (
         ("+task.kinematics.scale.finger=0.1", "task.kinematics: scale: 'finger' matches none of turn"),
         ("task.kinematics.start={elbow: 3}", "joint elbow at 3 is outside its limits 0 .. 2.6"),
-        ("+task.kinematics.limits.elbow=[1, 0]", "limits: joint elbow has 1 .. 0, not lowest, highest"),
+        ("+task.kinematics.limits={elbow: [1, 0]}", "limits: joint elbow has 1 .. 0, not lowest, highest"),
         ("task.kinematics.model=plab:none.xml", "there is no model"),
         ("task.kinematics.root=foot", "has no body 'foot'; choose from: base, upper"),
         ("task.kinematics.sha256=abc", "differs from the model of this configuration"),

@@ -577,8 +577,7 @@ class Scene:
         low, high = tool.lower_bound, tool.upper_bound
         inside = all(a <= x <= b for a, x, b in zip(low, tool.position, high, strict=True))
         _require(inside, f"{label} has position {tool.position} outside its bounds {low} .. {high}")
-        smaller = f"{label} has gap {tool.gap:g} below its minimal_gap {tool.minimal_gap:g}"
-        _require(tool.gap >= tool.minimal_gap, smaller)
+        _require(tool.gap >= tool.minimal_gap, f"{label} has gap {tool.gap:g}, below its minimal_gap")
         self._require_slow(f"{label}: scale {tool.scale}", tool.largest_step())
 
     def _require_slow(self, label: str, way: float) -> None:
@@ -661,11 +660,7 @@ class Camera:
     far: float = 10.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            SceneError: If an attribute is invalid; the message names it.
-        """
+        """Check the values; SceneError names an invalid attribute."""
         object.__setattr__(self, "position", vector3(self.position))
         object.__setattr__(self, "target", vector3(self.target))
         if math.dist(self.position, self.target) < 1e-9:

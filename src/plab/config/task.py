@@ -136,7 +136,7 @@ class KinematicsConfig(ranges.Section):
     )
     free: bool = False
     start: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, list[float]] = field(default_factory=dict, metadata=ranges.within(ranges.vector, 2))
+    limits: dict[str, list[Any]] = field(default_factory=dict, metadata=ranges.within(ranges.vector, 2))
     together: dict[str, str] = field(default_factory=dict)
     omit: list[str] = field(default_factory=list)
     friction: float = field(default=5.0, metadata=ranges.NOT_NEGATIVE)

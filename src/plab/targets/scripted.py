@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import located
 from plab.kinematics.chain import matched
-from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
+from plab.plugins import scipy
+from plab.scenes import MANIPULATOR_SHAPES, MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 DRAWS = 200
@@ -72,7 +74,7 @@ class ActionTrack:
 
 @dataclass
 class Script(Recipe):
-    """A scripted demonstration.
+    """A scripted demonstration of the manipulators that can move, the first of which has the rule ``motion``.
 
     Attributes:
         seed: Random seed, >= 0.
@@ -86,6 +88,8 @@ class Script(Recipe):
     youngs_modulus: float | None = field(default=None, kw_only=True)
     poisson_ratio: float | None = field(default=None, kw_only=True)
     yield_stress: float | None = field(default=None, kw_only=True)
+
+    motion = "translate"
 
     @property
     def material(self) -> dict[str, float]:
@@ -110,8 +114,9 @@ class Script(Recipe):
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
         """Sample actions once; raise _TooLong if they do not fit into an episode."""
-        if not tracks:
-            raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
+        fitting = [name for name, kind in MANIPULATOR_SHAPES.items() if kind.motion == self.motion]
+        if not tracks or tracks[0].tool.shape not in fitting:
+            raise TargetError(f"target.recipe needs {' or '.join(fitting)} as first moving manipulator")
         self.plan(scene, tracks, rng)
         if max(map(len, tracks)) > EPISODE_STEPS:
             raise _TooLong
@@ -171,7 +176,7 @@ class DrawTarget(Script):
             way = self._stroke(at - np.asarray(body.center)[[0, 2]], room, rng)
             track.go([way[0], 0.0, way[1]])
             at = at + way
-        track.go([0.0, depth + tool.size[1], 0.0])
+        track.go([0.0, depth + tool.size[-1], 0.0])
 
     def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Sample a stroke [2] from a position [2] that ends within +-room [2] of the body's centre."""
@@ -235,6 +240,8 @@ class RollTarget(Script):
     depth: list[float]
     yaw: list[float]
 
+    motion = "roll"
+
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         track, tool = tracks[0], tracks[0].tool
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
@@ -263,6 +270,8 @@ class LiftTarget(Script):
     turn: list[float]
     x: list[float]
     z: list[float]
+
+    motion = "grip"
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         track = tracks[0]
@@ -347,7 +356,7 @@ class Posture:
         steps: Minimum number of environment steps.
     """
 
-    joints: dict[str, list[float]]
+    joints: dict[str, list[Any]]
     steps: int = 1
 
 
@@ -394,7 +403,8 @@ class GestureTarget(Script):
 
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
     """Sample uniformly from a range [low, high], after checking the range."""
-    if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
+    numbers = len(limits) == 2 and all(isinstance(limit, float | int) for limit in limits)
+    if not numbers or not -math.inf < limits[0] <= limits[1] < math.inf:
         raise TargetError(f"target.{name} must be a range [low, high], not {list(limits)}")
     return rng.uniform(limits[0], limits[1])
 
@@ -412,10 +422,9 @@ def _top(body: Body) -> float:
 
 
 def _below(tool: Manipulator) -> float:
-    """Extent of an upright manipulator below its position [domain units]."""
-    if tool.kind.support is None:
-        raise TargetError(f"the recipe needs a manipulator that presses with its lower end, not {tool.shape}")
-    return float(tool.kind.support(tool.size, np.array([0.0, -1.0, 0.0])))
+    """Extent of a manipulator below its position [domain units]."""
+    turn = scipy.spatial.transform.Rotation.from_quat(tool.rotation, scalar_first=True)
+    return float(tool.kind.support(tool.size, turn.inv().apply([0.0, -1.0, 0.0])))  # type: ignore[misc]
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
