@@ -143,7 +143,7 @@ class PressTarget(Script):
         offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
         x, z = offset * rng.choice([-1.0, 1.0], size=2)
         depth = _draw(rng, "depth", self.depth)
-        height = tool.position[1] - _below(tool) - _top(scene.bodies[0])
+        height = tool.position[1] - _extent(tool, 0.0, -1.0, 0.0) - _top(scene.bodies[0])
         track.go([x, -height, z])
         track.go([0.0, -depth, 0.0])
         track.go([0.0, (EPISODE_STEPS - len(track)) * tool.scale[1] / 2, 0.0], EPISODE_STEPS - len(track))
@@ -169,7 +169,7 @@ class DrawTarget(Script):
         track, tool = tracks[0], tracks[0].tool
         body = scene.bodies[0]
         depth = _draw(rng, "depth", self.depth)
-        track.go([0.0, _top(body) - depth - (tool.position[1] - _below(tool)), 0.0])
+        track.go([0.0, _top(body) - depth - (tool.position[1] - _extent(tool, 0.0, -1.0, 0.0)), 0.0])
         at = np.asarray(tool.position)[[0, 2]]
         room = body.half_extent()[[0, 2]] - self.margin
         for _ in range(_count(rng, "strokes", self.strokes)):
@@ -286,10 +286,10 @@ class LiftTarget(Script):
 
 @dataclass
 class CarryTarget(Script):
-    """Two spheres grip the last body, place it on the first and release it.
+    """Two manipulators grip the last body, place it on the first and release it.
 
     Attributes:
-        squeeze: Range of the depth to which each sphere presses into the body before the lift [domain units].
+        squeeze: Range of the depth to which each presses into the body before the lift [domain units].
         press: Range of the depth to which the body is pressed onto the other one [domain units].
     """
 
@@ -303,8 +303,8 @@ class CarryTarget(Script):
         x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
         rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
         # The leading sphere rises next to the base and passes its edge at the height of the top.
-        lead = max(abs(tool.position[0] - cargo.center[0]) + tool.size[0] for tool in tools)
-        lowest = min(tool.position[1] - tool.size[0] for tool in tools)
+        lead = max(abs(tool.position[0] - cargo.center[0]) + _extent(tool, 1.0, 0.0, 0.0) for tool in tools)
+        lowest = min(tool.position[1] - _extent(tool, 0.0, -1.0, 0.0) for tool in tools)
         edge = abs(x) - base.half_extent()[0] - lead
         beside = math.copysign(edge * rise / (_top(base) - lowest), x)
         for track in tracks:
@@ -318,7 +318,7 @@ class CarryTarget(Script):
 
 @dataclass
 class PushTarget(Script):
-    """A sphere between the legs of a table pushes one of them outwards at the end of the episode, while the
+    """A manipulator between the legs of a table pushes one outwards at the end of the episode, while the
     rest of the table stays in place.
 
     Attributes:
@@ -340,7 +340,7 @@ class PushTarget(Script):
         length = float(np.linalg.norm(way))
         direction = way / length
         edge = float(np.min(leg.half_extent() / np.maximum(np.abs(direction), 1e-9)))
-        meet = length - edge - tool.size[0]
+        meet = length - edge - _extent(tool, *direction)
         track.go(meet * direction)
         track.go(_draw(rng, "distance", self.distance) * direction, self.steps)
         track.delay()
@@ -421,10 +421,10 @@ def _top(body: Body) -> float:
     return body.center[1] + float(body.half_extent()[1])
 
 
-def _below(tool: Manipulator) -> float:
-    """Extent of a manipulator below its position [domain units]."""
+def _extent(tool: Manipulator, *way: float) -> float:
+    """Extent of a manipulator from its position along a unit vector [domain units]."""
     turn = scipy.spatial.transform.Rotation.from_quat(tool.rotation, scalar_first=True)
-    return float(tool.kind.support(tool.size, turn.inv().apply([0.0, -1.0, 0.0])))  # type: ignore[misc]
+    return float(tool.kind.support(tool.size, turn.inv().apply(way)))  # type: ignore[misc]
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
