@@ -351,8 +351,8 @@ class Posture:
     """Joint positions at the end of one part of a gesture.
 
     Attributes:
-        joints: Ranges of positions by patterns of joints. Joints that match one pattern share one sample of
-            the relative position within the range; other joints do not move.
+        joints: Ranges of positions by patterns of joints. Joints that match one pattern move to the same
+            sampled position; other joints do not move.
         steps: Minimum number of environment steps.
     """
 
