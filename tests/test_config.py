@@ -271,7 +271,9 @@ def test_ranges(kind):
         ("task.manipulators.left.scale=[0.01]", "scale"),
         ("task.manipulators.left.rotation=[1,1,0,0]", "quaternion"),
         ("task.manipulators.left.friction=-1", "friction -1"),
+        ("task.manipulators.left.position=[0.5,1.5,0.5]", "position"),
+        ("task=Chopsticks task.manipulators.chopsticks.gap=0.05", "minimal_gap"),
     ],
 )
 def test_scenes_that_cannot_be_simulated(override, message):
-    assert message in why((ConfigError, SceneError), lambda: build_scene(load_config([override])))
+    assert message in why((ConfigError, SceneError), lambda: build_scene(load_config(override.split())))

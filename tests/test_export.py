@@ -47,9 +47,8 @@ def test_a_vtk_series_is_read_back(recording):
 
 def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
     scene = recording.scene
-    stretched = np.diag([1.2, 1.0, 1.0])
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    F = np.broadcast_to(turn @ stretched, recording.F.shape)
+    F = np.broadcast_to(turn @ np.diag([1.2, 1.0, 1.0]), recording.F.shape)
     found = files.quantities(dataclasses.replace(recording, F=F), 2)
     assert found["volume_ratio"] == pytest.approx(1.2)
     # log(1.2) along one axis, less a third of it along all.

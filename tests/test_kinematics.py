@@ -105,8 +105,7 @@ def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
     mount[:3, :3], mount[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
     frames = mount @ chain.frames(joints)
     own = [g for g in range(compiled.ngeom) if compiled.geom_type[g] in (3, 6) and compiled.geom_contype[g]]
-    expected = np.array([data.geom_xpos[g] for g in own])
-    gaps = np.linalg.norm(frames[:, None, :3, 3] - expected, axis=-1)
+    gaps = np.linalg.norm(frames[:, None, :3, 3] - data.geom_xpos[own], axis=-1)
     assert len(chain.links) == len(own) and max(gaps.min(axis=0).max(), gaps.min(axis=1).max()) < 1e-12
     # A capsule's axis, the second of its frame here, is the third of MuJoCo's.
     for link, frame, g in zip(chain.links, frames, gaps.argmin(axis=1), strict=True):
@@ -145,6 +144,8 @@ def test_a_urdf_arm_has_boxes_and_capsules_around_its_meshes(tmp_path: Path) -> 
         extents = np.abs((corners - frame[:3, 3]) @ frame[:3, :3]).max(axis=0)
         np.testing.assert_allclose(sorted(extents), sorted(reach), atol=1e-6)
         assert extents.argmax() == np.argmax(reach)
+    (tmp_path / "arm.urdf").write_text(URDF.format(meshes=MESH.format("bar.obj")))
+    assert len(read_model(str(tmp_path / "arm.urdf"), size=2.0)[0].links) == 2
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +254,7 @@ def test_mistakes_in_a_model_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong, named in (
         ("+task.kinematics.scale.finger=0.1", "task.kinematics: scale: 'finger' matches none of turn"),
         ("task.kinematics.start={elbow: 3}", "joint elbow at 3 is outside its limits 0 .. 2.6"),
-        ("+task.kinematics.limits.elbow=[1, 0]", "limits: joint elbow has 1 .. 0, not lowest, highest"),
+        ("+task.kinematics.limits={elbow: [1, 0]}", "limits: joint elbow has 1 .. 0, not lowest, highest"),
         ("task.kinematics.model=plab:none.xml", "there is no model"),
         ("task.kinematics.root=foot", "has no body 'foot'; choose from: base, upper"),
         ("task.kinematics.sha256=abc", "differs from the model of this configuration"),

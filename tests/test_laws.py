@@ -99,9 +99,7 @@ def test_triaxial_compression_of_sand_fails_by_mohr_and_coulomb() -> None:
     sand = LAWS["drucker_prager"]
     for angle in (20.0, 35.0):
         f = np.diag([0.98, 1.004, 1.004]).reshape(9)
-        tau, _new = sand.update(
-            np.zeros(9), f, DT, *sand.coefficients_of({**sand.defaults, "friction_angle": angle})
-        )
+        tau, _new = sand.update(np.zeros(9), f, DT, *coefficients(sand, friction_angle=angle))
         sine = math.sin(math.radians(angle))
         assert tau[1] / tau[0] == pytest.approx((1.0 - sine) / (1.0 + sine), rel=1e-9)
 

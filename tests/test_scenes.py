@@ -16,8 +16,7 @@ from plab.sim import shapes
 
 
 def test_the_volume_of_a_sphere_is_that_of_its_formula():
-    body = make_body("sphere", (0.5, 0.5, 0.5), (0.2,), 100)
-    assert body.volume == pytest.approx(4 / 3 * math.pi * 0.2**3)
+    assert make_body("sphere", (0.5,) * 3, (0.2,), 100).volume == pytest.approx(4 / 3 * math.pi * 0.2**3)
 
 
 def test_the_time_step_that_is_advised_is_accepted():
@@ -39,8 +38,7 @@ def test_a_camera_projects_what_it_sees_back_from_any_side():
         rows, columns = np.mgrid[:24, :32] + 0.5
         np.testing.assert_allclose(camera.project(seen), np.stack([columns, rows], axis=-1), atol=1e-9)
         np.testing.assert_allclose(camera.intrinsics()[:2, 2], camera.project(np.array(camera.target)))
-    wrong = {"field_of_view": 180.0, "size": (0, 4), "near": 100.0, "target": (0.5, 1, 0.5)}
-    for name, value in wrong.items():
+    for name, value in {"field_of_view": 180, "size": (0, 4), "near": 100.0, "target": (0.5, 1, 0.5)}.items():
         with pytest.raises(SceneError, match=name):
             Camera(**{"position": (0.5, 1, 0.5), "target": (0.5, 0, 0.5), name: value})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from plab.config import ConfigError, build_scene, load_config
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
-from plab.scenes import Scene, sample_particles
+from plab.scenes import Manipulator, Scene, sample_particles
 from plab.targets import (
     TARGET_SEED,
     TargetError,
@@ -24,6 +25,8 @@ from plab.targets import (
 from plab.targets.build import load_mass, save_mass, target_path
 from toy_runner import COARSE_32
 
+RECORDER = SimpleNamespace(precision="float32", device="cpu")
+"""Stand-in for a simulator in the cache key."""
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}
 BALL = {"shape": "sphere", "center": [0.5, 0.5, 0.5], "size": [0.1]}
 CUBE = {"shape": "box", "center": [0.3, 0.2, 0.5], "size": [0.2, 0.2, 0.2]}
@@ -72,8 +75,7 @@ def test_ring_lies_around_the_pillar(override):
     assert x.shape == (10000, 3) and 0.105 <= from_axis.min() < 0.107 and 0.163 < from_axis.max() <= 0.165
     assert 0 <= x[:, 1].min() < 1e-3 and 0.059 < x[:, 1].max() <= 0.06
     # Uniform: the mean over the annulus of r is 2/3 (R^3 - r^3) / (R^2 - r^2), and all directions are equal.
-    expected = 2 / 3 * (0.165**3 - 0.105**3) / (0.165**2 - 0.105**2)
-    assert from_axis.mean() == pytest.approx(expected, rel=5e-3)
+    assert from_axis.mean() == pytest.approx(2 / 3 * (0.165**3 - 0.105**3) / (0.165**2 - 0.105**2), rel=5e-3)
     np.testing.assert_allclose(x.mean(0), [pillar[0], 0.03, pillar[2]], atol=5e-3)
 
 
@@ -113,16 +115,10 @@ def test_refused_targets(rope):
             build_target(rope, target)
 
 
-class Recorder:
-    """Stand-in for a simulator in the cache key."""
-
-    precision, device = "float32", "cpu"
-
-
 def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypatch):
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
     actions = np.zeros((50, 6))
-    path = target_path(Recorder, rope, actions)
+    path = target_path(RECORDER, rope, actions)
     mass = np.zeros((64, 64, 64))
     mass[3, 4, 5], mass[63, 63, 63] = 1.25e-4, np.float32(0.1)
     assert load_mass(path, 64) is None
@@ -131,19 +127,17 @@ def test_cached_mass_comes_back_and_other_scenes_do_not(rope, tmp_path, monkeypa
     # Other users of a shared cache can read it.
     assert path.stat().st_mode & 0o777 == 0o666 & path.parent.stat().st_mode
     # The length of later episodes does not matter, all else does.
-    assert target_path(Recorder, replace(rope, horizon=3), actions) == path
-    assert target_path(Recorder, replace(rope, yield_stress=51.0), actions) != path
-    assert target_path(Recorder, replace(rope, particle_seed=1), actions) != path
-    assert target_path(Recorder, rope, actions + 1e-4) != path
-    with monkeypatch.context() as patch:
-        patch.setattr(Recorder, "precision", "float64")
-        assert target_path(Recorder, rope, actions) != path
+    assert target_path(RECORDER, replace(rope, horizon=3), actions) == path
+    assert target_path(RECORDER, replace(rope, yield_stress=51.0), actions) != path
+    assert target_path(RECORDER, replace(rope, particle_seed=1), actions) != path
+    assert target_path(RECORDER, rope, actions + 1e-4) != path
+    assert target_path(SimpleNamespace(precision="float64", device="cpu"), rope, actions) != path
     # Damaged, or unwritable.
     for content in (path.read_bytes()[:100], b""):
         path.write_bytes(content)
         assert load_mass(path, 64) is None
     monkeypatch.setenv("PLAB_CACHE_DIR", str(path))
-    save_mass(blocked := target_path(Recorder, rope, actions), mass)
+    save_mass(blocked := target_path(RECORDER, rope, actions), mass)
     assert load_mass(blocked, 64) is None
 
 
@@ -179,6 +173,16 @@ def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, 
     simulator.rollout(np.stack([script] * 5), gradient=False)
     reached = simulator.mass_tensor()[0]
     np.testing.assert_allclose(reached, problem.target_mass[0], atol=1e-5 * reached.max())
+
+
+def test_a_capsule_presses_draws_and_pushes_as_far_as_a_ball():
+    ball = Manipulator("Sphere", (0.03,), (0.5, 0.3, 0.5), scale=(0.01,) * 3)
+    lying = replace(ball, shape="Capsule", size=(0.2, 0.03), rotation=(0.5**0.5, 0.5**0.5, 0.0, 0.0))
+    tools = {"Torus": lying, "Writer": lying, "Table": replace(lying, rotation=ball.rotation)}
+    for task, tool in tools.items():
+        scene, target = load(f"task={task}")
+        first, second = (demonstration(replace(scene, manipulators=(one,)), target) for one in (ball, tool))
+        np.testing.assert_array_equal(first, second)
 
 
 def few(mass: np.ndarray, value: float) -> np.ndarray:
@@ -229,6 +233,8 @@ def test_targets_that_cannot_be_built(tmp_path, released, device):
     check_target(*press)
     with pytest.raises(TargetError, match="press"):
         build_target(*press)
+    with pytest.raises(TargetError, match="Sphere or Capsule"):
+        check_target(load("task=RollingPin")[0], press[1])
     overrides = ("task=Rope", *COARSE_32[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
     with pytest.raises(TargetError, match=r"sim\.particles_scale"):
         Problem([load_config(overrides)])

@@ -575,8 +575,9 @@ class Scene:
             values = getattr(tool, name)
             _require(bool(np.isfinite(values).all()), f"{label} needs a finite {name}, not {values}")
         low, high = tool.lower_bound, tool.upper_bound
-        ordered = all(a <= b for a, b in zip(low, high, strict=True))
-        _require(ordered, f"{label} has a lower_bound {low} above its upper_bound {high}")
+        inside = all(a <= x <= b for a, x, b in zip(low, tool.position, high, strict=True))
+        _require(inside, f"{label} has position {tool.position} outside its bounds {low} .. {high}")
+        _require(tool.gap >= tool.minimal_gap, f"{label} has gap {tool.gap:g}, below its minimal_gap")
         self._require_slow(f"{label}: scale {tool.scale}", tool.largest_step())
 
     def _require_slow(self, label: str, way: float) -> None:
@@ -659,11 +660,7 @@ class Camera:
     far: float = 10.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            SceneError: If an attribute is invalid; the message names it.
-        """
+        """Check the values; SceneError names an invalid attribute."""
         object.__setattr__(self, "position", vector3(self.position))
         object.__setattr__(self, "target", vector3(self.target))
         if math.dist(self.position, self.target) < 1e-9:

@@ -30,7 +30,8 @@ def at_least(path: str, value: float, low: float) -> None:
 
 def vector(path: str, value: Sequence[float], length: int) -> None:
     """Raise :class:`ConfigError` unless a value consists of ``length`` finite numbers."""
-    if len(value) != length or not all(math.isfinite(entry) for entry in value):
+    numbers = all(isinstance(entry, float | int) and math.isfinite(entry) for entry in value)
+    if len(value) != length or not numbers:
         raise ConfigError(f"{path} must be {length} finite numbers, not {list(value)}")
 
 

@@ -92,15 +92,6 @@ class ManipulatorConfig(ranges.Section):
     gap: float | None = field(default=None, metadata=ranges.POSITIVE)
     minimal_gap: float | None = field(default=None, metadata=ranges.POSITIVE)
 
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for errors that :meth:`plab.scenes.Scene.validate` does not check."""
-        super().check(path)
-        for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
-            if not low <= at <= high:
-                raise ConfigError(
-                    f"{path}.position: {axis} = {at:g} is outside its bounds {low:g} .. {high:g}"
-                )
-
     def build(self) -> Manipulator:
         """Return the scene's manipulator."""
         values: dict[str, Any] = {
@@ -145,7 +136,7 @@ class KinematicsConfig(ranges.Section):
     )
     free: bool = False
     start: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, list[float]] = field(default_factory=dict, metadata=ranges.within(ranges.vector, 2))
+    limits: dict[str, list[Any]] = field(default_factory=dict, metadata=ranges.within(ranges.vector, 2))
     together: dict[str, str] = field(default_factory=dict)
     omit: list[str] = field(default_factory=list)
     friction: float = field(default=5.0, metadata=ranges.NOT_NEGATIVE)

@@ -28,7 +28,8 @@ def read_model(
     """Read the tree below a body of a model: hinges and slides as joints, collision geometry as links.
 
     Capsules, boxes, spheres and cylinders are used directly; meshes are replaced by a capsule or box of the
-    size of their oriented bounding box. Visual geometry, planes and free joints are left out.
+    size of their oriented bounding box. Visual geometry, planes and free joints are left out. Models are
+    cached until the file itself changes.
 
     Args:
         model: MJCF or URDF file, or ``package:path`` of a file in an installed package.
@@ -51,7 +52,9 @@ def read_model(
         if spec is None or not spec.submodule_search_locations:
             raise ModelError(f"{model}: package {package} is not installed: pip install 'plab[hands]'")
         path = os.path.join(spec.submodule_search_locations[0], inside)
-    chain = _read(path, root, size, tuple(omit))
+    if not os.path.isfile(path):
+        raise ModelError(f"there is no model {path}")
+    chain = _read(path, os.stat(path).st_mtime_ns, root, size, tuple(omit))
     return chain, hashlib.sha256(repr(chain).encode()).hexdigest()
 
 
@@ -62,13 +65,11 @@ def locate_model(model: str, *, by_name: bool) -> str:
 
 
 @functools.lru_cache(maxsize=32)
-def _read(path: str, root: str | None, size: float, omit: tuple[str, ...]) -> Chain:
+def _read(path: str, _changed: int, root: str | None, size: float, omit: tuple[str, ...]) -> Chain:
     try:
         import mujoco
     except ImportError:
         raise ModelError(f"{path} is read with mujoco: pip install 'plab[hands]'") from None
-    if not os.path.isfile(path):
-        raise ModelError(f"there is no model {path}")
     try:
         m = mujoco.MjModel.from_xml_path(path)
     except ValueError as error:

@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import located
 from plab.kinematics.chain import matched
-from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
+from plab.plugins import scipy
+from plab.scenes import MANIPULATOR_SHAPES, MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 DRAWS = 200
@@ -72,7 +74,7 @@ class ActionTrack:
 
 @dataclass
 class Script(Recipe):
-    """A scripted demonstration.
+    """A scripted demonstration of the manipulators that can move, the first of which has the rule ``motion``.
 
     Attributes:
         seed: Random seed, >= 0.
@@ -86,6 +88,8 @@ class Script(Recipe):
     youngs_modulus: float | None = field(default=None, kw_only=True)
     poisson_ratio: float | None = field(default=None, kw_only=True)
     yield_stress: float | None = field(default=None, kw_only=True)
+
+    motion = "translate"
 
     @property
     def material(self) -> dict[str, float]:
@@ -110,8 +114,9 @@ class Script(Recipe):
 
     def sample(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> np.ndarray:
         """Sample actions once; raise _TooLong if they do not fit into an episode."""
-        if not tracks:
-            raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
+        fitting = [name for name, kind in MANIPULATOR_SHAPES.items() if kind.motion == self.motion]
+        if not tracks or tracks[0].tool.shape not in fitting:
+            raise TargetError(f"target.recipe needs {' or '.join(fitting)} as first moving manipulator")
         self.plan(scene, tracks, rng)
         if max(map(len, tracks)) > EPISODE_STEPS:
             raise _TooLong
@@ -138,7 +143,7 @@ class PressTarget(Script):
         offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
         x, z = offset * rng.choice([-1.0, 1.0], size=2)
         depth = _draw(rng, "depth", self.depth)
-        height = tool.position[1] - _below(tool) - _top(scene.bodies[0])
+        height = tool.position[1] - _extent(tool, 0.0, -1.0, 0.0) - _top(scene.bodies[0])
         track.go([x, -height, z])
         track.go([0.0, -depth, 0.0])
         track.go([0.0, (EPISODE_STEPS - len(track)) * tool.scale[1] / 2, 0.0], EPISODE_STEPS - len(track))
@@ -164,14 +169,14 @@ class DrawTarget(Script):
         track, tool = tracks[0], tracks[0].tool
         body = scene.bodies[0]
         depth = _draw(rng, "depth", self.depth)
-        track.go([0.0, _top(body) - depth - (tool.position[1] - _below(tool)), 0.0])
+        track.go([0.0, _top(body) - depth - (tool.position[1] - _extent(tool, 0.0, -1.0, 0.0)), 0.0])
         at = np.asarray(tool.position)[[0, 2]]
         room = body.half_extent()[[0, 2]] - self.margin
         for _ in range(_count(rng, "strokes", self.strokes)):
             way = self._stroke(at - np.asarray(body.center)[[0, 2]], room, rng)
             track.go([way[0], 0.0, way[1]])
             at = at + way
-        track.go([0.0, depth + tool.size[1], 0.0])
+        track.go([0.0, depth + tool.size[-1], 0.0])
 
     def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Sample a stroke [2] from a position [2] that ends within +-room [2] of the body's centre."""
@@ -235,6 +240,8 @@ class RollTarget(Script):
     depth: list[float]
     yaw: list[float]
 
+    motion = "roll"
+
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         track, tool = tracks[0], tracks[0].tool
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
@@ -264,6 +271,8 @@ class LiftTarget(Script):
     x: list[float]
     z: list[float]
 
+    motion = "grip"
+
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         track = tracks[0]
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
@@ -277,10 +286,10 @@ class LiftTarget(Script):
 
 @dataclass
 class CarryTarget(Script):
-    """Two spheres grip the last body, place it on the first and release it.
+    """Two manipulators grip the last body, place it on the first and release it.
 
     Attributes:
-        squeeze: Range of the depth to which each sphere presses into the body before the lift [domain units].
+        squeeze: Range of the depth to which each presses into the body before the lift [domain units].
         press: Range of the depth to which the body is pressed onto the other one [domain units].
     """
 
@@ -294,8 +303,8 @@ class CarryTarget(Script):
         x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
         rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
         # The leading sphere rises next to the base and passes its edge at the height of the top.
-        lead = max(abs(tool.position[0] - cargo.center[0]) + tool.size[0] for tool in tools)
-        lowest = min(tool.position[1] - tool.size[0] for tool in tools)
+        lead = max(abs(tool.position[0] - cargo.center[0]) + _extent(tool, 1.0, 0.0, 0.0) for tool in tools)
+        lowest = min(tool.position[1] - _extent(tool, 0.0, -1.0, 0.0) for tool in tools)
         edge = abs(x) - base.half_extent()[0] - lead
         beside = math.copysign(edge * rise / (_top(base) - lowest), x)
         for track in tracks:
@@ -309,7 +318,7 @@ class CarryTarget(Script):
 
 @dataclass
 class PushTarget(Script):
-    """A sphere between the legs of a table pushes one of them outwards at the end of the episode, while the
+    """A manipulator between the legs of a table pushes one outwards at the end of the episode, while the
     rest of the table stays in place.
 
     Attributes:
@@ -331,7 +340,7 @@ class PushTarget(Script):
         length = float(np.linalg.norm(way))
         direction = way / length
         edge = float(np.min(leg.half_extent() / np.maximum(np.abs(direction), 1e-9)))
-        meet = length - edge - tool.size[0]
+        meet = length - edge - _extent(tool, *direction)
         track.go(meet * direction)
         track.go(_draw(rng, "distance", self.distance) * direction, self.steps)
         track.delay()
@@ -342,12 +351,12 @@ class Posture:
     """Joint positions at the end of one part of a gesture.
 
     Attributes:
-        joints: Ranges of positions by patterns of joints. Joints that match one pattern share one sample of
-            the relative position within the range; other joints do not move.
+        joints: Ranges of positions by patterns of joints. Joints that match one pattern move to the same
+            sampled position; other joints do not move.
         steps: Minimum number of environment steps.
     """
 
-    joints: dict[str, list[float]]
+    joints: dict[str, list[Any]]
     steps: int = 1
 
 
@@ -394,7 +403,8 @@ class GestureTarget(Script):
 
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
     """Sample uniformly from a range [low, high], after checking the range."""
-    if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
+    numbers = len(limits) == 2 and all(isinstance(limit, float | int) for limit in limits)
+    if not numbers or not -math.inf < limits[0] <= limits[1] < math.inf:
         raise TargetError(f"target.{name} must be a range [low, high], not {list(limits)}")
     return rng.uniform(limits[0], limits[1])
 
@@ -411,11 +421,10 @@ def _top(body: Body) -> float:
     return body.center[1] + float(body.half_extent()[1])
 
 
-def _below(tool: Manipulator) -> float:
-    """Extent of an upright manipulator below its position [domain units]."""
-    if tool.kind.support is None:
-        raise TargetError(f"the recipe needs a manipulator that presses with its lower end, not {tool.shape}")
-    return float(tool.kind.support(tool.size, np.array([0.0, -1.0, 0.0])))
+def _extent(tool: Manipulator, *way: float) -> float:
+    """Extent of a manipulator from its position along a unit vector [domain units]."""
+    turn = scipy.spatial.transform.Rotation.from_quat(tool.rotation, scalar_first=True)
+    return float(tool.kind.support(tool.size, turn.inv().apply(way)))  # type: ignore[misc]
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:

@@ -43,7 +43,7 @@ def page(recording: RecordedRollout, every: int | None = None, *, surface: bool 
         surface: Whether to show plasticine as smooth surfaces instead of particles.
     """
     last = len(recording.x) - 1
-    every = every or max(1, -(-last // _FRAMES))
+    every = every or max(1, -(-last // (_FRAMES - 1)))
     steps = sorted({*range(0, last, every), last})
     scene, mass, x = recording.scene, recording.target_mass, recording.x[[0, -1]]
     camera = scene_camera(scene, mass, (round(300 * _ASPECT), 300), x, recording.poses[::5])
