@@ -575,7 +575,8 @@ class Scene:
             values = getattr(tool, name)
             _require(bool(np.isfinite(values).all()), f"{label} needs a finite {name}, not {values}")
         low, high = tool.lower_bound, tool.upper_bound
-        inside = all(a <= x <= b for a, x, b in zip(low, tool.position, high, strict=True))
+        ranges = zip(low, tool.position, high, strict=True)
+        inside = all(a <= x <= b for a, x, b in ranges) or not shape.scaled
         _require(inside, f"{label} has position {tool.position} outside its bounds {low} .. {high}")
         _require(tool.gap >= tool.minimal_gap, f"{label} has gap {tool.gap:g}, below its minimal_gap")
         self._require_slow(f"{label}: scale {tool.scale}", tool.largest_step())
