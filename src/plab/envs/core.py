@@ -273,8 +273,9 @@ class EpisodeBatch:
     def _ranged(self, cfgs: Sequence[Config]) -> list[Config]:
         """Return configurations, sharing one object between equal ones, and their ranges."""
         require_configs(cfgs)
-        cfgs = [cfgs[cfgs.index(cfg)] for cfg in cfgs]
-        unique = {id(cfg): cfg for cfg in cfgs}
+        given = list({id(cfg): cfg for cfg in cfgs}.values())
+        first = {id(cfg): given[given.index(cfg)] for cfg in given}
+        unique = {id(cfg): cfg for cfg in first.values()}
         for key, cfg in unique.items():
             if self._randomize is not None:
                 # Arrays and their numbers become lists and numbers.
@@ -282,7 +283,7 @@ class EpisodeBatch:
                 cfg = replace(cfg, task=replace(cfg.task, randomize=json.loads(text)))
                 cfg.check()
             unique[key] = with_own_materials(cfg)
-        return [unique[id(cfg)] for cfg in cfgs]
+        return [unique[id(first[id(cfg)])] for cfg in cfgs]
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
         self._problem: Problem | None = problem
