@@ -206,7 +206,7 @@ def test_load_on_a_mixed_folder(tmp_path: Path, rng) -> None:
         file["x"] = 1
     (tmp_path / "notes.txt").write_text("not a result")
     with pytest.warns(UserWarning, match="skipped 2 unreadable") as caught:
-        table = load(tmp_path, keys=["task.yield_stress"]).set_index("seed")
+        table = load(tmp_path, keys=["task.yield_stress", "iou"]).set_index("seed")
         assert "no run has 'method.nothing'" in why(ResultsError, load, tmp_path, keys=["method.nothing"])
     assert "foreign.h5" in str(caught[0].message) and broken.path.name in str(caught[0].message)
     assert table["status"].to_dict() == {3: "finished", 4: "running", 5: "interrupted"}, busy

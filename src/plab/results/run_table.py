@@ -117,7 +117,7 @@ def load(source: Source = "results", keys: Sequence[str] = (), *, index: bool = 
         raise ResultsError(f"keys must be a list of dotted keys, such as ['{keys}'], not the string '{keys}'")
     found, unreadable = rows(source, index=index)
     warn_of(unreadable)
-    table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
+    table = [row.values | {k: row.values.get(k, lookup(row.config, k)) for k in keys} for row in found]
     loaded = pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
     if strange := [key for key in keys if table and loaded[key].isna().all()]:
         raise ResultsError(f"no run has '{strange[0]}': use dotted keys, such as method.lr")
