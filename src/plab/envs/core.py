@@ -9,9 +9,11 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import itertools
 import json
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -303,8 +305,9 @@ class EpisodeBatch:
         # No step is left before the first reset.
         self._steps = np.full(self.size, self.horizon)
         self._over = np.zeros(self.size, bool)
-        # Environments with the same configuration have independent samples.
-        self._seeds = [(cfg.seed, self.configs[:e].count(cfg)) for e, cfg in enumerate(self.configs)]
+        # Environments with the same configuration, one object, have independent samples.
+        numbers = defaultdict[int, Iterator[int]](itertools.count)
+        self._seeds = [(cfg.seed, next(numbers[id(cfg)])) for cfg in self.configs]
         self._episodes = np.full(self.size, -1)
         self._simulator.reset()
         self._observe_starts()
