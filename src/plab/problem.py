@@ -246,10 +246,10 @@ class Problem:
         self.scenes = simulator.scenes
         self._stale_mass |= set(particles)
         if targets:
-            masses, distances = list(self.target_mass), self.distances()
+            distances = self.distances()
             for e, (mass, distance) in targets.items():
-                masses[e], distances[e] = mass, target_distance(mass) if distance is None else distance
-            simulator.set_target(np.stack(masses), np.stack(distances))
+                distances[e] = target_distance(mass) if distance is None else distance
+            simulator.change_targets({e: (mass, distances[e]) for e, (mass, _) in targets.items()})
             self.target_mass, self._distances = simulator.target_mass, distances
             for e in targets:
                 self.best_iou[e] = soft_iou(self.target_mass[e], self.target_mass[e])

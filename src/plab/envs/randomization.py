@@ -160,9 +160,12 @@ class EpisodeRandomizer:
         scenes, particles, targets, put = list(problem.scenes), {}, {}, {}
         for e, own in values.items():
             base = self._pools[id(self._cfgs[e])][own[SCENE]] if SCENE in own else self._bases[e]
-            cfg = with_values(base.cfg, own)
-            with located(", ".join(own), ArgumentError):
-                scenes[e] = _applied(self._scenes[e], self._bases[e].scene, self._checked(cfg))
+            cfg, scene = base.cfg, base.scene
+            if own.keys() - {SCENE, STAGE}:
+                cfg = with_values(cfg, own)
+                with located(", ".join(own), ArgumentError):
+                    scene = self._checked(cfg)
+            scenes[e] = _applied(self._scenes[e], self._bases[e].scene, scene)
             place = base, yaws(cfg.task, own), _places(scenes[e])
             if place != self._placed[e]:
                 particles[e] = _moved(*place)

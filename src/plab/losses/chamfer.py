@@ -36,12 +36,10 @@ class Chamfer(ParticleTerm):
         self.nearest = sim.share(ti.field(sim.real, shape=shape))
         self.found = ti.field(sim.real, shape=shape)
 
-    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Compute the points of new targets."""
-        made = {own.tobytes(): own for own in mass}
-        points = {key: mass_portions(own, POINTS) for key, own in made.items()}
-        self.sim.write(self.points, np.stack([points[own.tobytes()] for own in mass]))
-        self.sim.write(self.nearest, np.full((self.sim.batch, POINTS), FAR))
+    def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Compute the points of the target."""
+        self.sim.write(self.points, mass_portions(mass, POINTS), first=e)
+        self.sim.write(self.nearest, np.full(POINTS, FAR), first=e)
 
     @ti.func
     def measure(self, e, x, v):

@@ -19,10 +19,10 @@ class Density(NodeTerm):
         self.target = sim.reference("mass")
         self.total = sim.share(ti.field(ti.f64, shape=sim.batch))
 
-    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Sum the targets' masses, the measure of an empty grid."""
+    def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Sum the target's mass, the measure of an empty grid."""
         # Targets of the release may have negative masses.
-        self.sim.write(self.total, [np.abs(own).sum() for own in mass])
+        self.sim.write(self.total, np.abs(mass).sum(), first=e)
 
     @ti.func
     def empty(self, e):

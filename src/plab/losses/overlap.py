@@ -21,12 +21,14 @@ class Overlap(NodeTerm):
         """Request the target's mass tensor; without a target the IoU is NaN."""
         super().attach(sim)
         self.target = sim.reference("mass")
-        self._scale = Constants(np.full((2, sim.batch), np.nan))
+        self._sums = np.full((2, sim.batch), np.nan)
+        self._scale = Constants(self._sums)
         self._total = sim.mass * sim.particles
 
-    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Store the sums and maxima of the targets."""
-        self._scale = Constants([mass.sum(axis=(1, 2, 3)), mass.max(axis=(1, 2, 3))])
+    def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Store the sum and the maximum of the target."""
+        self._sums[:, e] = mass.sum(), mass.max()
+        self._scale = Constants(self._sums)
 
     @ti.func
     def measure(self, e, node, mass):

@@ -35,11 +35,12 @@ class Term:
         """Attach the term to a simulator and allocate fields; called once."""
         self.sim = sim
 
-    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
-        """Process new targets.
+    def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Process a new target.
 
         Args:
-            mass: Target mass tensors, shape [batch, n, n, n], float64.
+            e: Environment.
+            mass: The target's mass tensor, shape [n, n, n], float64.
             sdf: Distance of each node to the target [domain units], same shape.
         """
 

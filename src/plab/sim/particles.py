@@ -119,7 +119,9 @@ class Particles:
     def start_order(self, positions: Sequence[np.ndarray]) -> None:
         """Set the initial order from the positions of each environment [domain units], [particle, 3]."""
         engine = self.engine
-        self.initial = np.stack([curve_order(x, engine.n) for x in positions])
+        # Environments often share their positions.
+        orders = {key: curve_order(x, engine.n) for key, x in {id(x): x for x in positions}.items()}
+        self.initial = np.stack([orders[id(x)] for x in positions])
         batch, particles = self.initial.shape
         padding = np.arange(particles, engine.tiles * engine.lanes)
         rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)
@@ -220,18 +222,33 @@ class Particles:
 
     # -- to and from the host -----------------------------------------------------------------------
 
-    def pack(self, state: State) -> np.ndarray:
-        """Convert user arrays to tiles in the initial order; the last tile is padded with particles at
-        rest."""
+    def at_rest(self, x: np.ndarray) -> np.ndarray:
+        """Convert positions, shape [batch, particle, 3], to tiles of particles at rest in the initial order;
+        the last tile is padded."""
         engine = self.engine
-        b, n = engine.batch, engine.particles
-        flat = np.zeros((b, engine.tiles * engine.lanes, STATE), NUMPY_TYPES[engine.real])
-        flat[:, :, [AT_F, AT_F + 4, AT_F + 8]] = 1.0
-        parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
-        values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self.initial[:, :, None], axis=1)
-        tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
-        return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
+        shape = engine.batch * engine.tiles, STATE, engine.lanes
+        tiles = np.zeros(shape, NUMPY_TYPES[engine.real])
+        tiles[:, [AT_F, AT_F + 4, AT_F + 8]] = 1.0
+        self._put(tiles, 0, x)
+        return tiles.reshape(-1, engine.lanes)
+
+    def pack(self, state: State) -> np.ndarray:
+        """Convert user arrays to tiles in the initial order, as :meth:`at_rest`."""
+        packed = self.at_rest(state.x)
+        tiles = packed.reshape(-1, STATE, self.engine.lanes)
+        for first, values in ((AT_V, state.v), (AT_C, state.C), (AT_F, state.F)):
+            self._put(tiles, first, values)
+        return packed
+
+    def _put(self, tiles: np.ndarray, first: int, values: np.ndarray) -> None:
+        """Write the entries of all particles to tiles, from entry ``first``."""
+        b, lanes = self.engine.batch, self.engine.lanes
+        rows = np.reshape(values, (*self.initial.shape, -1))
+        ordered = np.take_along_axis(rows, self.initial[:, :, None], axis=1)
+        whole, rest = divmod(ordered.shape[1], lanes)
+        places = tiles.reshape(b, -1, STATE, lanes).swapaxes(2, 3)[..., first : first + ordered.shape[2]]
+        places[:, :whole] = ordered[:, : whole * lanes].reshape(b, whole, lanes, -1)
+        places[:, whole:, :rest] = ordered[:, None, whole * lanes :]
 
     def unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray | None = None) -> State:
         """Convert the tiles of one state to user arrays, with poses; ``order``, shape [batch, particle],

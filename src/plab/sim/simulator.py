@@ -276,19 +276,31 @@ class Simulator:
         """
         self._require_runtime()
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
-        held = {"mass": self._real(mass), "sdf": self._real(sdf)}
-        for name, value in held.items():
-            if value.shape != expected:
-                raise ArgumentError(f"target {name} has shape {value.shape}, not {expected}")
-            require_finite(f"target {name}", value, "node", axes=3)
+        for name, value in (("mass", mass), ("sdf", sdf)):
+            if np.shape(value) != expected:
+                raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
+            require_finite(f"target {name}", self._real(value), "node", axes=3)
+        self.target_mass = mass
+        self.change_targets(dict(enumerate(zip(mass, sdf, strict=True))))
+
+    def change_targets(self, targets: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> None:
+        """Replace the targets of some environments; the others must have targets.
+
+        Args:
+            targets: Finite mass tensor and distance by environment, as in :meth:`set_target`.
+        """
+        self._require_runtime()
         self.changes += 1
-        # A copy, because the caller may modify and pass the same array again.
-        self.target_mass = np.array(mass)
-        for name, field in self._engine.references.items():
-            self._engine.write(field, held[name])
-        exact = held["mass"].astype(np.float64)
-        for term in self._engine.terms:
-            term.set_target(exact, held["sdf"])
+        # A copy, because callers may modify and pass the same array again, and keep the former masses.
+        self.target_mass = np.array(self.target_mass)
+        for e, (mass, sdf) in targets.items():
+            self.target_mass[e] = mass
+            held = {"mass": self._real(mass), "sdf": self._real(sdf)}
+            for name, field in self._engine.references.items():
+                self._engine.write(field, held[name], first=e * self.grid_size**3)
+            exact = held["mass"].astype(np.float64)
+            for term in self._engine.terms:
+                term.set_target(e, exact, held["sdf"])
 
     def change_scenes(self, scenes: Sequence[Scene], particles: Mapping[int, np.ndarray]) -> None:
         """Replace all scenes by scenes of the same kind between episodes, without recompilation.
@@ -863,7 +875,11 @@ class Simulator:
         """Return checked initial positions, by default sampled from the scenes."""
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
-        given = map(sample_particles, scenes) if particles is None else particles
+        given = particles
+        if given is None:
+            # Environments often share a scene.
+            drawn = {key: sample_particles(own) for key, own in {id(own): own for own in scenes}.items()}
+            given = [drawn[id(own)] for own in scenes]
         names = [f"particles[{e}]" if self.batch > 1 else "particles" for e in range(self.batch)]
         return [checked_positions(x, scenes[0], name) for x, name in zip(given, names, strict=True)]
 
@@ -871,10 +887,7 @@ class Simulator:
         self._particles.start_order(positions)
         self._engine.fill_bodies(self.scenes, self._particles.initial)
         self._start_manipulators()
-        x = np.stack(positions)
-        identity = np.broadcast_to(np.eye(3), (*x.shape, 3))
-        start = State(x, np.zeros_like(x), np.zeros((*x.shape, 3)), identity, self._initial_poses)
-        from_host(self._initial, self._particles.pack(start))
+        from_host(self._initial, self._particles.at_rest(np.stack(positions)))
 
     def _start_manipulators(self) -> None:
         self._initial_poses = initial_poses(self.scenes)

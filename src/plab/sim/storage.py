@@ -326,13 +326,15 @@ class Storage:
         copy_memory(self._address_of(field), out, False)
         return out.astype(np.float64)
 
-    def write(self, field: ti.Field, values: ArrayLike) -> None:
-        """Write all entries of a shared field, given numbers with the field's leading shape."""
+    def write(self, field: ti.Field, values: ArrayLike, first: int = 0) -> None:
+        """Write entries of a shared field, given numbers with the field's leading shape: from row ``first``
+        along its first axis."""
         require_current(self.runtime)
         with np.errstate(over="ignore"):
             numbers = np.ascontiguousarray(values, NUMPY_TYPES[field.dtype])
-        assert numbers.size == math.prod(field.shape) * getattr(field, "n", 1)
-        copy_memory(self._address_of(field), numbers, True)
+        size, row = (math.prod(shape) * getattr(field, "n", 1) for shape in (field.shape, field.shape[1:]))
+        assert numbers.size + first * row <= size and numbers.size % row == 0
+        copy_memory(self._address_of(field) + first * row * numbers.itemsize, numbers, True)
 
     def _address_of(self, field: ti.Field) -> int:
         if self._addresses is None:
