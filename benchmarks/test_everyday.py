@@ -15,6 +15,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from plab.config import Config, build_scene, load_config
+from plab.envs.core import EpisodeBatch
 from plab.objective import target_sdf
 from plab.problem import Problem
 from plab.results import load
@@ -60,12 +61,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("database", [False, True], ids=["files", "database"])
+@pytest.mark.parametrize("index", [False, True], ids=["files", "index"])
 def test_load_results(
-    benchmark: BenchmarkFixture, results: Path, database: bool, monkeypatch: pytest.MonkeyPatch
+    benchmark: BenchmarkFixture, results: Path, index: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(results.parent / "cache"))
-    table = benchmark.pedantic(load, (results,), {"database": database}, rounds=5, warmup_rounds=1)
+    table = benchmark.pedantic(load, (results,), {"index": index}, rounds=5, warmup_rounds=1)
     assert len(table) == RUNS
 
 
@@ -96,6 +97,17 @@ def test_step(benchmark: BenchmarkFixture, problem: Problem, still: np.ndarray) 
 def test_gradient_of_a_rollout(benchmark: BenchmarkFixture, problem: Problem, still: np.ndarray) -> None:
     rollout = benchmark(problem.rollout, still, gradient=True)
     assert np.isfinite(rollout.gradient).all()
+
+
+def test_reset_to_random_scenes(benchmark: BenchmarkFixture) -> None:
+    words = ["variant=random", "+task.randomize.scenes=4", "observe_target=1", "observe_particles=10"]
+    batch = EpisodeBatch([load_config(["task=Move", *words])] * 8)
+    benchmark(batch.reset)
+
+
+def test_build_a_batch(benchmark: BenchmarkFixture) -> None:
+    cfg = load_config(["task=Move", "sim.grid_size=32"])
+    benchmark.pedantic(Problem, ([cfg] * 32,), rounds=5, warmup_rounds=1)
 
 
 def test_build_a_scene(benchmark: BenchmarkFixture) -> None:
