@@ -245,9 +245,10 @@ class Particles:
         b, lanes = self.engine.batch, self.engine.lanes
         rows = np.reshape(values, (*self.initial.shape, -1))
         ordered = np.take_along_axis(rows, self.initial[:, :, None], axis=1)
-        whole, rest = divmod(ordered.shape[1], lanes)
-        places = tiles.reshape(b, -1, STATE, lanes).swapaxes(2, 3)[..., first : first + ordered.shape[2]]
-        places[:, :whole] = ordered[:, : whole * lanes].reshape(b, whole, lanes, -1)
+        _, particles, entries = ordered.shape
+        whole, rest = divmod(particles, lanes)
+        places = tiles.reshape(b, -1, STATE, lanes).swapaxes(2, 3)[..., first : first + entries]
+        places[:, :whole] = ordered[:, : whole * lanes].reshape(b, whole, lanes, entries)
         places[:, whole:, :rest] = ordered[:, None, whole * lanes :]
 
     def unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray | None = None) -> State:
