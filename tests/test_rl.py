@@ -273,8 +273,10 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -
         pd.testing.assert_series_equal(read(cfg.path).iterations["loss"], want.iterations["loss"])
 
 
-def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
+def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone, monkeypatch) -> None:
     """The buffer is required to continue training, but not before the final evaluation."""
+    left, progress = [], "_current_progress_remaining"
+    monkeypatch.setattr(Sb3Runner, "losses", lambda self: [left.append(getattr(self.model, progress)) or {}])
     cfg = make_config(tmp_path, "tqc")
     lost = cfg.path.with_suffix(".replay")
     with stopped_at(20, *STEPS["tqc"]):
@@ -286,6 +288,8 @@ def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
     with stopped_at(0, Sb3Runner, "judge"):
         run_config(replace(cfg, force=True), CACHE)
     assert not lost.exists()
+    # Of the algorithm's schedules, after 0, 24, 48 and 64 of 64 transitions.
+    assert left == [1.0, 0.625, 1.0, 0.625, 0.25, 0.0]
     run(cfg)
     assert_same_run(cfg, lone["tqc"][0])
 

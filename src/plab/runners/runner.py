@@ -316,6 +316,8 @@ class Runner:
     def judge(self, actions: np.ndarray) -> Episodes:
         """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
         simulator = self.problem.simulator
+        # Iterations may have changed scenes or initial states.
+        simulator.set_scenes(self.problem.scenes)
         simulator.set_contact("hard")
         repeated = np.concatenate([actions] * (simulator.batch // len(actions)))
         return self.problem.rollout(repeated, gradient=False, strict=False)

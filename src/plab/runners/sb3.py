@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,9 +104,11 @@ class Sb3Runner(PolicyRunner):
         return self.model.num_timesteps
 
     def cycle(self) -> None:
-        # The library's log entries stay in its logger.
-        watch = ConvertCallback(lambda known, _: self._watch(known["infos"]))
-        self.model.learn(self._cycle_steps, callback=watch, log_interval=None, reset_num_timesteps=False)
+        end, left = self.steps + self._cycle_steps, self.total_steps - self.steps
+        cycle = _Cycle(lambda known, _: self._watch(known["infos"]), end)
+        with suppress(_CycleEnd):
+            # The library's log entries stay in its logger.
+            self.model.learn(left, callback=cycle, log_interval=None, reset_num_timesteps=False)
 
     def _watch(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
@@ -149,6 +152,23 @@ class Sb3Runner(PolicyRunner):
 
     def policy(self, run: int) -> Policy:
         return Policy(self.model.policy)
+
+
+class _CycleEnd(Exception):
+    """End of a training cycle."""
+
+
+class _Cycle(ConvertCallback):
+    """Callback that ends a call of ``learn`` before the rollout after a number of transitions. Each call has
+    all remaining transitions, because schedules such as a learning rate's depend on their number."""
+
+    def __init__(self, watch: Any, end: int) -> None:
+        super().__init__(watch)
+        self._end = end
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps >= self._end:
+            raise _CycleEnd
 
 
 class _Replay(LibraryBuffer):
