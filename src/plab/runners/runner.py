@@ -257,7 +257,7 @@ class Runner:
 
     A family defines ``step`` or overrides :meth:`iterate`, and other hooks as needed. Order of calls:
     :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any :meth:`has_more`,
-    :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
+    :meth:`conclude` of each run, :meth:`judge`.
 
     Attributes:
         step: Method that makes one iteration of one run; it raises SimulationError if a state, loss or
@@ -306,9 +306,6 @@ class Runner:
         runs; mark failed ones with :meth:`Track.fail`. The wall time is shared equally."""
         for track in tracks:
             yield track, self.step(track)
-
-    def close(self) -> None:
-        """Release the objects of the iterations, also after a failure."""
 
     def conclude(self, track: Track) -> None:
         """Write additional files of a run, before the final evaluation."""
@@ -413,7 +410,6 @@ class Runner:
                             self.report(self.extent()[0], text)
             finally:
                 self.enter("")
-                self.close()
             with self._progress(" final evaluation"):
                 self._conclude()
 

@@ -40,9 +40,8 @@ class ModelKind:
         model: Class with the interface of Stable-Baselines3's algorithms.
         arguments: Function of the ``method`` section and the environments that returns keyword arguments of
             the class, including ``policy_kwargs``.
-        rollout_steps: Function of the ``method`` section that returns the number of steps of each environment
-            between updates, for on-policy algorithms; None for off-policy algorithms, which can pause after
-            any episode.
+        rollout_steps: Function of the ``method`` section that returns the steps of each environment between
+            updates, for on-policy algorithms; None for others, which can pause after any episode.
     """
 
     model: type[BaseAlgorithm]
@@ -105,10 +104,10 @@ class Sb3Runner(PolicyRunner):
 
     def cycle(self) -> None:
         end, left = self.steps + self._cycle_steps, self.total_steps - self.steps
-        cycle = _Cycle(lambda known, _: self._watch(known["infos"]), end)
+        watch = _Cycle(lambda known, _: self._watch(known["infos"]), end)
         with suppress(_CycleEnd):
             # The library's log entries stay in its logger.
-            self.model.learn(left, callback=cycle, log_interval=None, reset_num_timesteps=False)
+            self.model.learn(left, callback=watch, log_interval=None, reset_num_timesteps=False)
 
     def _watch(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
@@ -172,11 +171,7 @@ class _Cycle(ConvertCallback):
 
 
 class _Replay(LibraryBuffer):
-    """Replay buffer with the library's interface, for episodes of equal length that end by truncation.
-
-    Attributes:
-        kept: Stored transitions.
-    """
+    """Replay buffer with the library's interface, for episodes of equal length that end by truncation."""
 
     def __init__(
         self, buffer_size: int, *spaces: Any, sizes: Sizes, total_steps: int, **options: Any
