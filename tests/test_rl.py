@@ -85,10 +85,6 @@ def carry(cfgs: list[Config]) -> list[Outcome]:
     return run_batch(cfgs, cache=CACHE)
 
 
-def statuses(cfgs: list[Config]) -> list[str]:
-    return [one.status for one in carry(cfgs)]
-
-
 def partial(cfg: Config) -> RunResult:
     """File of an unfinished run."""
     return read(cfg.path.with_suffix(".partial.h5"))
@@ -273,8 +269,10 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -
         pd.testing.assert_series_equal(read(cfg.path).iterations["loss"], want.iterations["loss"])
 
 
-def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
+def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone, monkeypatch) -> None:
     """The buffer is required to continue training, but not before the final evaluation."""
+    left, progress = [], "_current_progress_remaining"
+    monkeypatch.setattr(Sb3Runner, "losses", lambda self: [left.append(getattr(self.model, progress)) or {}])
     cfg = make_config(tmp_path, "tqc")
     lost = cfg.path.with_suffix(".replay")
     with stopped_at(20, *STEPS["tqc"]):
@@ -287,6 +285,7 @@ def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
     with stopped_at(0, Sb3Runner, "judge"):
         run_config(replace(cfg, force=True), CACHE)
     assert not lost.exists()
+    assert left == [1.0, 0.625, 1.0, 0.625, 0.25, 0.0], "after 0, 24, 48 and 64 of 64 transitions"
     run(cfg)
     assert_same_run(cfg, lone["tqc"][0])
 
@@ -357,7 +356,7 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
     cfgs, alone = configs(tmp_path, method), lone[method]
     break_steps(monkeypatch, {9})
     break_evaluation(monkeypatch, 1)
-    assert statuses(cfgs) == ["finished"] * 3
+    assert [one.status for one in carry(cfgs)] == ["finished"] * 3
     assert_same_run(cfgs[2], alone[2])
     judged, taught, other = (read(cfg.path) for cfg in cfgs)
     assert [one.provenance.get("broken_episodes") for one in (judged, taught, other)] == [None, 2, None]
@@ -388,7 +387,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
     assert [one.status for one in ended] == ["finished", "failed", "failed"]
     assert ended[1].message.startswith("iteration 1: all 6 ")
     assert ended[2].message.startswith("iteration 2:") and "not finite" in ended[2].message
-    assert statuses(cfgs[:1]) == ["before"]
+    assert [one.status for one in carry(cfgs[:1])] == ["before"]
     for cfg, want in zip(cfgs, lone["sac"], strict=True):
         carry([cfg])
         assert_same_run(cfg, want)
@@ -397,7 +396,8 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
 def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
     """Halve until the buffers fit ``sim.memory_mb``; a single buffer is always tried."""
     cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
-    assert statuses(cfgs) == ["finished"] * 2 and {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
+    assert [one.status for one in carry(cfgs)] == ["finished"] * 2
+    assert {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
 
 
 # ---------------------------------------------------------------- CUDA

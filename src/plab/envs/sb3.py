@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -76,7 +76,7 @@ class PlabVecEnv(VecEnv):
         seeds = [seed for seed in self._seeds if seed is not None] or None
         observation, info = self.batch.reset(seeds=seeds, options=self._options[0], episode=self.next_episode)
         self.next_episode = None
-        self.reset_infos = self._split(info, {})
+        self.reset_infos = [info_of(info, e, {}) for e in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -93,7 +93,8 @@ class PlabVecEnv(VecEnv):
         if not self.together:
             self.batch.require_running()
         done = self.batch.step(self._actions, strict=False)
-        observation, infos = done.observation, self._split(done.info, done.failures)
+        infos = [info_of(done.info, e, done.failures) for e in range(self.num_envs)]
+        observation = done.observation
         over = done.truncated if self.together else done.terminated | done.cut_off
         for number, info in enumerate(infos):
             info["TimeLimit.truncated"] = bool(over[number] and not done.terminated[number])
@@ -135,7 +136,3 @@ class PlabVecEnv(VecEnv):
     ) -> list[bool]:
         """Return False for every sub-environment, because there are no wrappers."""
         return [False for _ in self._get_indices(indices)]
-
-    def _split(self, info: Mapping[str, Any], failures: Mapping[int, str]) -> list[dict[str, Any]]:
-        """Return one info per sub-environment."""
-        return [info_of(info, e, failures) for e in range(self.num_envs)]

@@ -178,11 +178,6 @@ class IdentifyRunner(Runner):
         steps = len(self._actions) * len(scenes)
         return Step(measured | found, self._actions, dict(state), steps_forward=steps)
 
-    def close(self) -> None:
-        """Restore the configuration's scene."""
-        if hasattr(self, "problem"):
-            self.problem.simulator.set_scenes(self.problem.scenes)
-
     def summary_line(self, means: Mapping[str, float], tracks: Any) -> str:
         """Return the misfit, and the parameters with their standard deviations."""
         fit = (f"{n} {means[n]:.4g} ± {means[f'{n}_deviation']:.2g}" for n in self.method.parameters)

@@ -139,11 +139,6 @@ class MpcRunner(PlannerRunner):
         )
         yield track, step
 
-    def close(self) -> None:
-        """Restore the scene's initial state for the evaluation."""
-        if hasattr(self, "problem"):
-            self.problem.simulator.set_scenes(self.problem.scenes)
-
     def _execute(self, actions: np.ndarray) -> None:
         """Execute actions, shape [k, A], in the hard contact model; plan next from the resulting state."""
         simulator = self.problem.simulator

@@ -258,7 +258,7 @@ class Runner:
 
     A family defines ``step`` or overrides :meth:`iterate`, and other hooks as needed. Order of calls:
     :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate` while any :meth:`has_more`,
-    :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
+    :meth:`conclude` of each run, :meth:`judge`.
 
     Attributes:
         step: Method that makes one iteration of one run; it raises SimulationError if a state, loss or
@@ -308,15 +308,14 @@ class Runner:
         for track in tracks:
             yield track, self.step(track)
 
-    def close(self) -> None:
-        """Release the objects of the iterations, also after a failure."""
-
     def conclude(self, track: Track) -> None:
         """Write additional files of a run, before the final evaluation."""
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Simulate the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
         simulator = self.problem.simulator
+        # Iterations may have changed scenes or initial states.
+        simulator.set_scenes(self.problem.scenes)
         simulator.set_contact("hard")
         repeated = np.concatenate([actions] * (simulator.batch // len(actions)))
         return self.problem.rollout(repeated, gradient=False, strict=False)
@@ -412,7 +411,6 @@ class Runner:
                             self.report(self.extent()[0], text)
             finally:
                 self.enter("")
-                self.close()
             with self._progress(" final evaluation"):
                 self._conclude()
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,9 +40,8 @@ class ModelKind:
         model: Class with the interface of Stable-Baselines3's algorithms.
         arguments: Function of the ``method`` section and the environments that returns keyword arguments of
             the class, including ``policy_kwargs``.
-        rollout_steps: Function of the ``method`` section that returns the number of steps of each environment
-            between updates, for on-policy algorithms; None for off-policy algorithms, which can pause after
-            any episode.
+        rollout_steps: Function of the ``method`` section that returns the steps of each environment between
+            updates, for on-policy algorithms; None for others, which can pause after any episode.
     """
 
     model: type[BaseAlgorithm]
@@ -105,9 +105,11 @@ class Sb3Runner(PolicyRunner):
         return self.model.num_timesteps
 
     def cycle(self) -> None:
-        # The library's log entries stay in its logger.
-        watch = ConvertCallback(lambda known, _: self._watch(known["infos"]))
-        self.model.learn(self._cycle_steps, callback=watch, log_interval=None, reset_num_timesteps=False)
+        end, left = self.steps + self._cycle_steps, self.total_steps - self.steps
+        watch = _Cycle(lambda known, _: self._watch(known["infos"]), end)
+        with suppress(_CycleEnd):
+            # The library's log entries stay in its logger.
+            self.model.learn(left, callback=watch, log_interval=None, reset_num_timesteps=False)
 
     def _watch(self, infos: Sequence[Mapping[str, Any]]) -> bool:
         if "episode" in infos[0]:
@@ -154,12 +156,25 @@ class Sb3Runner(PolicyRunner):
         return Policy(self.model.policy)
 
 
-class _Replay(LibraryBuffer):
-    """Replay buffer with the library's interface, for episodes of equal length that end by truncation.
+class _CycleEnd(Exception):
+    """End of a training cycle."""
 
-    Attributes:
-        kept: Stored transitions.
-    """
+
+class _Cycle(ConvertCallback):
+    """Callback that ends a call of ``learn`` before the rollout after a number of transitions. Each call has
+    all remaining transitions, because schedules such as a learning rate's depend on their number."""
+
+    def __init__(self, watch: Any, end: int) -> None:
+        super().__init__(watch)
+        self._end = end
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps >= self._end:
+            raise _CycleEnd
+
+
+class _Replay(LibraryBuffer):
+    """Replay buffer with the library's interface, for episodes of equal length that end by truncation."""
 
     def __init__(
         self, buffer_size: int, *spaces: Any, sizes: Sizes, total_steps: int, **options: Any
