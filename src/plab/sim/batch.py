@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 from plab.scenes import MATERIAL_KEYS, Scene, SceneError, find_law
+
+Value = TypeVar("Value")
 
 SHARED = (
     "particle_count",
@@ -23,6 +25,12 @@ SHARED = (
     "floor_stencil",
 )
 """Properties, in addition to manipulator shapes, that all scenes of a simulator must share."""
+
+
+def once_each(function: Callable[[Any], Value], values: Sequence[Any]) -> list[Value]:
+    """Return a function of each value, computed once per object, because environments often share one."""
+    results = {key: function(value) for key, value in {id(value): value for value in values}.items()}
+    return [results[id(value)] for value in values]
 
 
 def scene_kind(scene: Scene) -> tuple[tuple[str, Any], ...]:
@@ -43,9 +51,9 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
     if not scenes:
         raise SceneError("a simulator needs at least one scene")
     first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
-    for number, scene in enumerate(scenes):
-        scene.validate()
-        for (name, own), (_, other) in zip(scene_kind(scene), scene_kind(first), strict=True):
+    once_each(lambda scene: scene.validate(), scenes)
+    for number, kind in enumerate(once_each(scene_kind, scenes)):
+        for (name, own), (_, other) in zip(kind, scene_kind(first), strict=True):
             if own != other:
                 values = "" if name == "manipulators" else f": {own}, not {other}"
                 raise SceneError(

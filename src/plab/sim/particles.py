@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from plab.sim.batch import once_each
 from plab.sim.compiler import ti
 from plab.sim.state import State
 from plab.sim.storage import AT_C, AT_F, AT_V, BYTES, STATE
@@ -119,9 +120,7 @@ class Particles:
     def start_order(self, positions: Sequence[np.ndarray]) -> None:
         """Set the initial order from the positions of each environment [domain units], [particle, 3]."""
         engine = self.engine
-        # Environments often share their positions.
-        orders = {key: curve_order(x, engine.n) for key, x in {id(x): x for x in positions}.items()}
-        self.initial = np.stack([orders[id(x)] for x in positions])
+        self.initial = np.stack(once_each(lambda x: curve_order(x, engine.n), positions))
         batch, particles = self.initial.shape
         padding = np.arange(particles, engine.tiles * engine.lanes)
         rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)

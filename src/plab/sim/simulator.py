@@ -19,6 +19,7 @@ from plab.sim.batch import (
     checked_positions,
     initial_poses,
     material_keys,
+    once_each,
     require_alike,
     require_finite,
     with_material,
@@ -875,11 +876,7 @@ class Simulator:
         """Return checked initial positions, by default sampled from the scenes."""
         if particles is not None and len(particles) != self.batch:
             raise ArgumentError(f"particles of {len(particles)} environments, not of {self.batch}")
-        given = particles
-        if given is None:
-            # Environments often share a scene.
-            drawn = {key: sample_particles(own) for key, own in {id(own): own for own in scenes}.items()}
-            given = [drawn[id(own)] for own in scenes]
+        given = once_each(sample_particles, scenes) if particles is None else particles
         names = [f"particles[{e}]" if self.batch > 1 else "particles" for e in range(self.batch)]
         return [checked_positions(x, scenes[0], name) for x, name in zip(given, names, strict=True)]
 
