@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +50,11 @@ def test_speed_prints_and_writes_complete_rows(
 
 
 @pytest.mark.nightly
-def test_the_benchmark_of_learning_times_both_parts() -> None:
-    trainings = (2, 1, "ppo"), (1, 1, "sac")
-    for row in rl.rows([*COARSE_32, "task=Move", "sim.horizon=3"], trainings, 1):
+def test_the_benchmarks_of_learning_and_everyday_use_run() -> None:
+    for row in rl.rows([*COARSE_32, "task=Move", "sim.horizon=3"], ((2, 1, "ppo"), (1, 1, "sac")), 1):
         assert row["simulate_ms"] > 0 and row["update_ms"] > 0
+    command = [sys.executable, "-m", "pytest", str(Path(rl.__file__).parent), "--benchmark-disable"]
+    assert subprocess.run(command).returncode == 0
 
 
 def still(observation: np.ndarray) -> np.ndarray:

@@ -48,8 +48,7 @@ def test_the_cushions_do_as_the_page_prints(monkeypatch):
 
 
 def test_a_body_has_the_values_of_its_task_and_its_own():
-    scene = build_scene(example())
-    dough, cushion = scene.materials
+    dough, cushion = build_scene(example()).materials
     assert (dough.youngs_modulus, dough.poisson_ratio, dough.yield_stress) == (5000.0, 0.2, 50.0)
     assert cushion.values == RUBBER
     yields = build_scene(example("variant=3", "task.poisson_ratio=0.1")).materials

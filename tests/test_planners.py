@@ -175,8 +175,7 @@ def test_stages_begin_from_the_best_of_the_stage_before() -> None:
     words = ["method=solve", "method.stages.search={population: 6, elites: 2, iterations: 2}"]
     words += [f"method.stages.{name}.contact_starts=0" for name in ("search", "descent")]
     words += ["method.stages.descent.population=5", "method.stages.descent.fresh=0.4"]
-    method = load_config(words).method
-    stages = make_planner(method, *START)
+    stages = make_planner(load_config(words).method, *START)
     shown = [iterate(stages, 0), iterate(stages, 1)]
     (last,), first = shown[1][0], iterate(stages, 2)[0][0]
     best = max((one for _, one in shown), key=lambda one: one[1]["score"])
