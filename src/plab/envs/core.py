@@ -151,7 +151,9 @@ class Transition:
     @property
     def cut_off(self) -> np.ndarray:
         """Mask of the episodes that have reached the horizon or diverged, shape [batch]."""
-        return self.truncated | np.isin(np.arange(len(self.truncated)), list(self.failures))
+        broken = np.zeros_like(self.truncated)
+        broken[list(self.failures)] = True
+        return self.truncated | broken
 
 
 @dataclass(frozen=True)
@@ -331,7 +333,9 @@ class EpisodeBatch:
     @property
     def over(self) -> np.ndarray:
         """Mask of the ended episodes, which must be reset, shape [batch]."""
-        return self._over | np.isin(np.arange(self.size), list(self.failures))
+        over = self._over.copy()
+        over[list(self.failures)] = True
+        return over
 
     @property
     def _simulator(self) -> Simulator:

@@ -38,8 +38,8 @@ class Chamfer(ParticleTerm):
 
     def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Compute the points of the target."""
-        self.sim.write(self.points, mass_portions(mass, POINTS), first=e)
-        self.sim.write(self.nearest, np.full(POINTS, FAR), first=e)
+        self.sim.write(self.points, mass_portions(mass, POINTS), e)
+        self.sim.write(self.nearest, np.full(POINTS, FAR), e)
 
     @ti.func
     def measure(self, e, x, v):

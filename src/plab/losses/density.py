@@ -22,7 +22,7 @@ class Density(NodeTerm):
     def set_target(self, e: int, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Sum the target's mass, the measure of an empty grid."""
         # Targets of the release may have negative masses.
-        self.sim.write(self.total, np.abs(mass).sum(), first=e)
+        self.sim.write(self.total, np.abs(mass).sum(), e)
 
     @ti.func
     def empty(self, e):

@@ -298,7 +298,7 @@ class Simulator:
             self.target_mass[e] = mass
             held = {"mass": self._real(mass), "sdf": self._real(sdf)}
             for name, field in self._engine.references.items():
-                self._engine.write(field, held[name], first=e * self.grid_size**3)
+                self._engine.write(field, held[name], e)
             exact = held["mass"].astype(np.float64)
             for term in self._engine.terms:
                 term.set_target(e, exact, held["sdf"])

@@ -326,15 +326,15 @@ class Storage:
         copy_memory(self._address_of(field), out, False)
         return out.astype(np.float64)
 
-    def write(self, field: ti.Field, values: ArrayLike, first: int = 0) -> None:
-        """Write entries of a shared field, given numbers with the field's leading shape: from row ``first``
-        along its first axis."""
+    def write(self, field: ti.Field, values: ArrayLike, e: int | None = None) -> None:
+        """Write all entries of a shared field, or those of environment ``e``, given numbers with the field's
+        leading shape."""
         require_current(self.runtime)
         with np.errstate(over="ignore"):
             numbers = np.ascontiguousarray(values, NUMPY_TYPES[field.dtype])
-        size, row = (math.prod(shape) * getattr(field, "n", 1) for shape in (field.shape, field.shape[1:]))
-        assert numbers.size + first * row <= size and numbers.size % row == 0
-        copy_memory(self._address_of(field) + first * row * numbers.itemsize, numbers, True)
+        size = math.prod(field.shape) * getattr(field, "n", 1) // (1 if e is None else self.batch)
+        assert numbers.size == size
+        copy_memory(self._address_of(field) + (e or 0) * size * numbers.itemsize, numbers, True)
 
     def _address_of(self, field: ti.Field) -> int:
         if self._addresses is None:
