@@ -477,7 +477,7 @@ def test_gradients_by_friction_and_gravity(touched: Simulator, contact: str) -> 
     np.testing.assert_allclose(*lower, rtol=1e-5, atol=1e-7 * np.abs(lower).max())
     # Without friction, a sphere that pushes along a row of nodes, which have no tangential velocity.
     smooth = Point(start(("Sphere",)), np.zeros_like(ACTIONS), world=np.zeros(len(world)))
-    smooth.state.poses[0, 1:3], smooth.actions[:, 0] = (10 * SCENE.dx, 0.5), 0.9
+    smooth.state.poses[0, 1:3], smooth.actions[:, 0] = (10 * SCENE.dx, 17 * SCENE.dx), 0.9
     bar, directions = touched.rollout(put(touched, [smooth])).gradient[0], np.eye(SCENE.action_dim)[:3]
     ways = {f"{d}": (action_way(smooth, d + 0.0 * bar), (bar * d).sum()) for d in directions}
     check_slopes(touched, ways)
