@@ -226,6 +226,9 @@ def test_runs_of_a_task_share_a_simulator():
     draw_runs(wanted, lambda: None, lambda cfg: made.append(shared_problem(cache, [cfg])) or made[-1])
     assert len(list(Path.cwd().glob("Rope-v[12]/*.webp"))) == 6 and made[0].simulator is made[1].simulator
     np.testing.assert_array_equal(record(cfg, run.best_actions, made[1]).x, record(cfg, run.best_actions).x)
+    absent = {Path(name): (Path("absent.h5"), False) for name in "abc"}
+    with pytest.raises(graphics.RenderError, match=r"^a cannot be replayed: .*absent.h5.*; and 2 more runs$"):
+        draw_runs(absent, lambda: None, made.pop)
 
 
 # ----------------------------------------------------------------------------------------------- command line

@@ -181,4 +181,5 @@ def draw_runs(
             report(number, folder.name)
             drawn()
     if troubles:
-        raise RenderError("; ".join(troubles))
+        more = f"; and {len(troubles) - 1} more runs" if len(troubles) > 1 else ""
+        raise RenderError(troubles[0] + more)
