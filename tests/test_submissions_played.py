@@ -221,18 +221,26 @@ def test_a_policy_is_run_only_if_asked(
     # Of five variants and ten unseen ones.
     monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2", "3"))
     monkeypatch.setattr("plab.cli.submissions.UNSEEN", UNSEEN[:2])
-    file = tmp_path / "a.pt"
-    torchscript(file, Acting(env.observation_space.shape[0]))
+    file, (size,) = tmp_path / "a.pt", env.observation_space.shape
+    good = torchscript(file, Acting(size))
     made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
-    entries = read(made).entries
+    packed = read(made)
+    (name,), entries = packed.policies, packed.entries
     assert [e.configuration.variant for e in entries] == ["1", "2", "3", *UNSEEN[:2]]
     assert len({e.checksum for e in entries}) == 5 and {e.steps for e in entries} == {60}
-    assert max(e.score for e in entries) > 0 and verify([str(made), *COARSE]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert str(made) in line and "--run-policies" in line
-    assert {one.outcome for one in read_verification(read(made))} == {NOT_RUN}
-    assert verify([str(made), *COARSE, "--run-policies"]) == 0
-    assert {one.outcome for one in read_verification(read(made))} == {HOLDS}
+    assert max(e.score for e in entries) > 0
+    for content, more, code, outcome, told in (
+        (good, [], 1, NOT_RUN, ["--run-policies"]),
+        (good, ["--run-policies"], 0, HOLDS, []),
+        (torchscript(file, Whim(size)), ["--run-policies"], 1, BROKE_OFF, ["not deterministic"]),
+        (b"no module", ["--run-policies"], 1, BROKE_OFF, ["cannot be loaded"]),
+    ):
+        write(replace(packed, policies={name: content}), made)
+        assert verify([str(made), *COARSE, *more]) == code
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == len(told)
+        assert all(str(made) in line and part in line for line, part in zip(lines, told, strict=True))
+        assert {one.outcome for one in read_verification(read(made))} == {outcome}
 
 
 def test_policies_whose_actions_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
