@@ -178,9 +178,10 @@ def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, A
 
 
 def _with_estimates(table: pd.DataFrame) -> pd.DataFrame:
-    """Estimate the remaining time of runs of unknown speed from similar finished runs."""
-    done = table["state"] == "done"
-    mean = table["seconds"].where(done).groupby([table["task"], table["method"]]).transform("mean")
-    share = (table["done"] / table["total"].where(table["total"] > 0)).fillna(0.0)
-    left = table["left"].fillna(mean * (1.0 - share).clip(lower=0.0)).mask(done, 0.0)
+    """Estimate the remaining time of runs of unknown speed from finished runs of the same task and method, in
+    proportion to the remaining iterations or episodes."""
+    done, own = table["state"] == "done", [table["task"], table["method"]]
+    mean = {name: table[name].where(done).groupby(own).transform("mean") for name in ("seconds", "total")}
+    rest = ((table["total"] - table["done"]) / mean["total"]).where(table["total"] > 0, 1.0)
+    left = table["left"].fillna(mean["seconds"] * rest).mask(done, 0.0)
     return table.assign(left=left)
