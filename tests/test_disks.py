@@ -177,9 +177,8 @@ def test_a_lock_has_one_holder_until_it_is_released_or_forgotten() -> None:
 
 def test_a_killed_process_holds_nothing() -> None:
     code = "import plab.results.running as m; lock = m.acquire('run.h5'); print('ready', flush=True); input()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    process = subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
     assert process.stdout.readline() == "ready\n" and held("run.h5") and acquire("run.h5") is None
     process.kill()
     process.communicate()

@@ -27,7 +27,7 @@ from plab.config.suite import suite_tasks
 from plab.files import read_members
 from plab.report.reference import paper_table
 from plab.results import ResultsError
-from plab.submissions import submission
+from plab.submissions import submission, verifying
 from plab.submissions.board import board
 from plab.submissions.submission import (
     UNSEEN,
@@ -42,15 +42,7 @@ from plab.submissions.submission import (
     read,
     write,
 )
-from plab.submissions.verifying import (
-    HOLDS,
-    LIES,
-    NOT_RUN,
-    TOLERANCE,
-    Verdict,
-    read_verification,
-    write_verification,
-)
+from plab.submissions.verifying import HOLDS, LIES, NOT_RUN, TOLERANCE, Verdict, read_verification
 from synthetic_runs import synthetic_run, template
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -222,19 +214,14 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
         assert "protocol=plab" in why(configuration_of, load_config(["task=Move", word]))
 
 
-@pytest.fixture
-def card(tmp_path: Path) -> Path:
-    (tmp_path / "card.yaml").write_text(yaml.safe_dump(GOOD))
-    return tmp_path / "card.yaml"
-
-
 def result(folder: Path, variant: str = "1", seed: int = 0) -> Path:
     config = template("adam", [f"results_dir={folder}", "task=Move", f"variant={variant}", f"seed={seed}"])
     return synthetic.save(synthetic_run(config, rows=4, score=0.4))
 
 
-def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.CaptureFixture) -> None:
-    folder, out = tmp_path / "results", tmp_path / "out.plabsub.zip"
+def test_results_become_a_submission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder, out, card = (tmp_path / name for name in ("results", "out.plabsub.zip", "card.yaml"))
+    card.write_text(yaml.safe_dump(GOOD))
     for variant in "12":
         result(folder, variant)
     result(folder, seed=1)
@@ -277,7 +264,7 @@ def judged(path: Path, scores: list[float], outcome: str = HOLDS) -> None:
     submission = read(path)
     pairs = zip(submission.entries, scores, strict=True)
     verdicts = [Verdict(e, own, outcome, "" if outcome == HOLDS else "why") for e, own in pairs]
-    write_verification(verdicts, submission, ())
+    verifying.write_verification(verdicts, submission, ())
 
 
 @pytest.fixture(scope="module")
@@ -350,8 +337,7 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
 
 
 def test_the_papers_numbers_are_a_table(leaders) -> None:
-    sections, _ = leaders
-    paper = sections["The paper's table"]
+    paper = leaders[0]["The paper's table"]
     lines = {(line["card"].name, line["status"]): line for line in paper["lines"]}
     assert len(lines) == len(paper["lines"]) == 6
     table = paper_table("iou_per_configuration").groupby("method")["iou_mean"].mean()

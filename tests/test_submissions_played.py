@@ -238,7 +238,6 @@ def test_a_policy_is_run_only_if_asked(
         write(replace(packed, policies={name: content}), made)
         assert verify([str(made), *COARSE, *more]) == code
         lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == len(told)
         assert all(str(made) in line and part in line for line, part in zip(lines, told, strict=True))
         assert {one.outcome for one in read_verification(read(made))} == {outcome}
 
