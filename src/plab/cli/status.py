@@ -55,9 +55,6 @@ def main(argv: Sequence[str]) -> None:
 
 # --------------------------------------------------------------------------------------------------- display
 
-INTERVAL = 1.0
-"""Update interval [s]."""
-
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
 """Colours of states, in the order of live runs."""
 
@@ -109,7 +106,7 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
             live.update(_screen(found), refresh=True)
             if len(found.runs) and found.runs["state"].isin(("done", "failed")).all():
                 return
-            pause(INTERVAL)
+            pause(1.0)
 
 
 def _screen(found: Survey) -> Group:
