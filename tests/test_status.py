@@ -17,8 +17,9 @@ import synthetic
 from plab.cli import status
 from plab.cli.status import main, watch
 from plab.config.selection import select
+from plab.results.run_file import NAMES
 from plab.results.running import acquire
-from plab.status import NAMES, STATES, survey
+from plab.status import STATES, survey
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:

@@ -23,7 +23,8 @@ from rich.table import Table
 from plab.cli.command import Parser, add_forms, add_sources, command_line, sources_and_words
 from plab.config.selection import select
 from plab.errors import ArgumentError, print_error
-from plab.status import NAMES, STATES, Survey, survey
+from plab.results.run_file import NAMES
+from plab.status import STATES, Survey, survey
 
 
 @command_line

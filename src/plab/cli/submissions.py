@@ -27,7 +27,7 @@ from plab.submissions.submission import (
     read,
     write,
 )
-from plab.submissions.verifying import HOLDS, TOLERANCE, submission_files
+from plab.submissions.verifying import HOLDS, NOT_RUN, TOLERANCE, submission_files
 from plab.targets.build import PHYSICS_VERSION
 
 _PACKAGE = "plab.submissions"
@@ -129,9 +129,12 @@ def verify(argv: Sequence[str]) -> int:
         # One line suffices for policies that were not run.
         for why in dict.fromkeys(one.why for one in verdicts if one.why):
             print_error(f"{path}: {why}")
-        kept = verifying.write_verification(verdicts, submission, words)
         good = sum(one.outcome == HOLDS for one in verdicts)
-        print(f"{path}: {good} of {len(verdicts)} claim(s) hold; written to {kept}")
+        kept = ""
+        if any(one.outcome != NOT_RUN for one in verdicts):
+            # Otherwise, the outcome of an earlier verification remains.
+            kept = f"; written to {verifying.write_verification(verdicts, submission, words)}"
+        print(f"{path}: {good} of {len(verdicts)} claim(s) hold{kept}")
         codes.append(int(good < len(verdicts)))
     return max(codes)
 
