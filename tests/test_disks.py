@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import pytest
@@ -175,12 +176,16 @@ def test_a_lock_has_one_holder_until_it_is_released_or_forgotten() -> None:
     assert not held("run.h5")
 
 
-def test_a_killed_process_holds_nothing() -> None:
+def test_a_killed_process_holds_nothing(monkeypatch) -> None:
     code = "import plab.results.running as m; lock = m.acquire('run.h5'); print('ready', flush=True); input()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    process = subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
     assert process.stdout.readline() == "ready\n" and held("run.h5") and acquire("run.h5") is None
-    process.kill()
-    process.communicate()
+    with monkeypatch.context() as patch:
+        # As if the file belonged to another user.
+        patch.setattr("plab.results.running.acquire", Mock(side_effect=PermissionError))
+        assert held("run.h5")
+        process.kill()
+        process.communicate()
+        assert not held("run.h5")
     assert lock_path("run.h5").exists() and not held("run.h5")

@@ -198,18 +198,24 @@ def test_load_on_a_mixed_folder(tmp_path: Path, rng) -> None:
     finish_run(tmp_path, rng)
     # A repetition under way is hidden by the finished file.
     RunFile(make_config(tmp_path, force=True)).record(make_row(0), make_state(rng))
+    # A failed run is being repeated.
     (busy := RunFile(make_config(tmp_path, seed=4))).record(make_row(0), make_state(rng))
+    busy.close("failed", "loss is nan")
+    busy = RunFile(make_config(tmp_path, seed=4))
     RunFile(make_config(tmp_path, seed=5)).release()
     broken = finish_run(tmp_path, rng, seed=6)
     truncate(broken.path)
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["x"] = 1
     (tmp_path / "notes.txt").write_text("not a result")
+    away = (tmp_path / "Rope-v2").rename(tmp_path.with_name(f"{tmp_path.name}-away"))
+    (tmp_path / "Rope-v2").symlink_to(away)
     with pytest.warns(UserWarning, match="skipped 2 unreadable") as caught:
         table = load(tmp_path, keys=["task.yield_stress", "iou"]).set_index("seed")
         assert "no run has 'method.nothing'" in why(ResultsError, load, tmp_path, keys=["method.nothing"])
     assert "foreign.h5" in str(caught[0].message) and broken.path.name in str(caught[0].message)
     assert table["status"].to_dict() == {3: "finished", 4: "running", 5: "interrupted"}, busy
+    assert (table["message"] == "").all()
     assert table.loc[3, ["task", "variant", "method"]].tolist() == ["Rope", "2", "adam"]
     numbers = ["score", "iou", "loss", "score_printed", "task.yield_stress"]
     assert table.loc[3, numbers].tolist() == [0.75, 0.4, 12.0, 0.3, 200.0]

@@ -17,8 +17,9 @@ import synthetic
 from plab.cli import status
 from plab.cli.status import main, watch
 from plab.config.selection import select
+from plab.results.run_file import NAMES
 from plab.results.running import acquire
-from plab.status import NAMES, STATES, survey
+from plab.status import STATES, survey
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:
@@ -111,13 +112,16 @@ def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
 
 
 def test_rest_is_estimated_from_finished_runs_of_the_same_task_and_method(folder: Path) -> None:
-    found = find(folder, "task=Rope", "variant=1,2", "seed=0,1,2")
-    (group,) = found.groups.itertuples()
+    longer = synthetic.run(folder, seed=3)
+    longer.config["method"]["iterations"] = 8
+    synthetic.save(longer)
+    words = ("task=Rope", "variant=1,2", "seed=0,1,2,3")
+    (group,) = find(folder, *words).groups.itertuples()
     assert group.mean_seconds == pytest.approx(10.5, abs=0.5)
-    # Three have done half, one is missing.
-    assert group.left == pytest.approx((3 * 0.5 + 1) * group.mean_seconds)
+    # Three have two of four iterations left, two are missing; finished runs have 16/3 on average.
+    assert group.left == pytest.approx((3 * 2 / (16 / 3) + 2) * group.mean_seconds)
     lock = acquire(begin(folder, 1, variant="2", seed=2))
-    found = find(folder, "task=Rope", "variant=1,2", "seed=0,1,2")
+    found = find(folder, *words)
     assert found.workers == 1 and found.eta == pytest.approx(found.groups["left"][0])
     lock.release()
 

@@ -27,30 +27,10 @@ from plab.config.suite import suite_tasks
 from plab.files import read_members
 from plab.report.reference import paper_table
 from plab.results import ResultsError
-from plab.submissions import submission
+from plab.submissions import submission, verifying
 from plab.submissions.board import board
-from plab.submissions.submission import (
-    UNSEEN,
-    Card,
-    Configuration,
-    Entry,
-    Submission,
-    checksum,
-    configuration_of,
-    encode,
-    parse_card,
-    read,
-    write,
-)
-from plab.submissions.verifying import (
-    HOLDS,
-    LIES,
-    NOT_RUN,
-    TOLERANCE,
-    Verdict,
-    read_verification,
-    write_verification,
-)
+from plab.submissions.submission import UNSEEN, Card, Configuration, Entry, Submission, read, write
+from plab.submissions.verifying import HOLDS, LIES, NOT_RUN, TOLERANCE, Verdict, read_verification
 from synthetic_runs import synthetic_run, template
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,7 +78,7 @@ def test_round_trip_of_plans(path: Path) -> None:
     entries = [(e.configuration.name, e.steps, e.score) for e in found.entries]
     assert entries == [("Move-v1", 100, 0.5), ("Move-v2", 5000, 0.5)]
     assert all(np.array_equal(e.actions, ACTIONS) and e.checksum == CHECKSUM for e in found.entries)
-    assert encode(found) == path.read_bytes()
+    assert submission.encode(found) == path.read_bytes()
     wrong = path.with_name("mine.zip")
     assert str(wrong) in why(write, found, wrong)
 
@@ -185,11 +165,11 @@ def test_the_budget_of_a_card_bounds_the_steps(tmp_path: Path) -> None:
 
 
 def test_cards_that_are_read() -> None:
-    assert parse_card(yaml.safe_dump(GOOD).encode(), "card.yaml") == CARD
+    assert submission.parse_card(yaml.safe_dump(GOOD).encode(), "card.yaml") == CARD
     del (short := dict(GOOD))["description"]
-    assert parse_card(yaml.safe_dump(short).encode(), "card.yaml") == CARD
+    assert submission.parse_card(yaml.safe_dump(short).encode(), "card.yaml") == CARD
     example = (ROOT / "examples" / "outside_agent" / "card.yaml").read_text(encoding="utf-8")
-    assert parse_card(example.encode(), "card.yaml").name == "PPO in one file"
+    assert submission.parse_card(example.encode(), "card.yaml").name == "PPO in one file"
     assert example in (ROOT / "docs" / "submissions.md").read_text(encoding="utf-8")
 
 
@@ -204,7 +184,7 @@ def test_cards_that_are_read() -> None:
     ],
 )
 def test_cards_that_are_refused(line: str, fault: str) -> None:
-    assert fault in why(parse_card, f"{yaml.safe_dump(GOOD)}{line}".encode(), "card.yaml")
+    assert fault in why(submission.parse_card, f"{yaml.safe_dump(GOOD)}{line}".encode(), "card.yaml")
 
 
 def test_configurations_have_their_names_and_compose_themselves() -> None:
@@ -214,18 +194,13 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
     }
     for name, words in names.items():
         cfg = load_config(words)
-        configuration = configuration_of(cfg)
-        assert configuration.name == name and checksum(configuration.config()) == checksum(cfg)
+        configuration = submission.configuration_of(cfg)
+        assert configuration.name == name
+        assert submission.checksum(configuration.config()) == submission.checksum(cfg)
     drawn = load_config(["task=Move", "variant=random", "seed_scene=3"])
-    assert "Move-vrandom3" in why(configuration_of, drawn)
+    assert "Move-vrandom3" in why(submission.configuration_of, drawn)
     for word in ("protocol.floor=release", "targets.source=there", "task.name=Mine"):
-        assert "protocol=plab" in why(configuration_of, load_config(["task=Move", word]))
-
-
-@pytest.fixture
-def card(tmp_path: Path) -> Path:
-    (tmp_path / "card.yaml").write_text(yaml.safe_dump(GOOD))
-    return tmp_path / "card.yaml"
+        assert "protocol=plab" in why(submission.configuration_of, load_config(["task=Move", word]))
 
 
 def result(folder: Path, variant: str = "1", seed: int = 0) -> Path:
@@ -233,8 +208,9 @@ def result(folder: Path, variant: str = "1", seed: int = 0) -> Path:
     return synthetic.save(synthetic_run(config, rows=4, score=0.4))
 
 
-def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.CaptureFixture) -> None:
-    folder, out = tmp_path / "results", tmp_path / "out.plabsub.zip"
+def test_results_become_a_submission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder, out, card = (tmp_path / name for name in ("results", "out.plabsub.zip", "card.yaml"))
+    card.write_text(yaml.safe_dump(GOOD))
     for variant in "12":
         result(folder, variant)
     result(folder, seed=1)
@@ -244,7 +220,7 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
     assert [e.configuration.name for e in found.entries] == ["Move-v1", "Move-v2"]
     assert found.entries[0].score == pytest.approx(0.4)
     assert found.entries[0].steps % 50 == 0 and 50 <= found.entries[0].steps <= 200
-    assert found.entries[0].checksum == checksum(load_config(["task=Move"]))
+    assert found.entries[0].checksum == submission.checksum(load_config(["task=Move"]))
 
 
 def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Callable[..., str]) -> None:
@@ -262,7 +238,7 @@ def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Ca
 
 
 def real(variant: str, steps: int, score: float, **which: Any) -> Entry:
-    own = checksum(Configuration("Move", variant).config())
+    own = submission.checksum(Configuration("Move", variant).config())
     return entry(variant, steps, score, checksum=own, **which)
 
 
@@ -277,7 +253,7 @@ def judged(path: Path, scores: list[float], outcome: str = HOLDS) -> None:
     submission = read(path)
     pairs = zip(submission.entries, scores, strict=True)
     verdicts = [Verdict(e, own, outcome, "" if outcome == HOLDS else "why") for e, own in pairs]
-    write_verification(verdicts, submission, ())
+    verifying.write_verification(verdicts, submission, ())
 
 
 @pytest.fixture(scope="module")
@@ -350,8 +326,7 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
 
 
 def test_the_papers_numbers_are_a_table(leaders) -> None:
-    sections, _ = leaders
-    paper = sections["The paper's table"]
+    paper = leaders[0]["The paper's table"]
     lines = {(line["card"].name, line["status"]): line for line in paper["lines"]}
     assert len(lines) == len(paper["lines"]) == 6
     table = paper_table("iou_per_configuration").groupby("method")["iou_mean"].mean()

@@ -24,7 +24,7 @@ from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.submissions import record
 from plab.submissions.submission import UNSEEN, SubmissionError, read, write
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, load_policy, play, read_verification
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, load_policy, play, read_verification
 from toy_runner import COARSE_32
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -222,17 +222,27 @@ def test_a_policy_is_run_only_if_asked(
     monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2", "3"))
     monkeypatch.setattr("plab.cli.submissions.UNSEEN", UNSEEN[:2])
     file = tmp_path / "a.pt"
-    torchscript(file, Acting(env.observation_space.shape[0]))
+    (size,) = env.observation_space.shape
+    good = torchscript(file, Acting(size))
     made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
-    entries = read(made).entries
+    packed = read(made)
+    (name,), entries = packed.policies, packed.entries
     assert [e.configuration.variant for e in entries] == ["1", "2", "3", *UNSEEN[:2]]
     assert len({e.checksum for e in entries}) == 5 and {e.steps for e in entries} == {60}
-    assert max(e.score for e in entries) > 0 and verify([str(made), *COARSE]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert str(made) in line and "--run-policies" in line
-    assert {one.outcome for one in read_verification(read(made))} == {NOT_RUN}
-    assert verify([str(made), *COARSE, "--run-policies"]) == 0
-    assert {one.outcome for one in read_verification(read(made))} == {HOLDS}
+    assert max(e.score for e in entries) > 0
+    for content, more, code, outcomes, told in (
+        (good, [], 1, set(), ["--run-policies"]),
+        (good, ["--run-policies"], 0, {HOLDS}, []),
+        # An earlier outcome remains.
+        (good, [], 1, {HOLDS}, ["--run-policies"]),
+        (torchscript(file, Whim(size)), ["--run-policies"], 1, {BROKE_OFF}, ["not deterministic"]),
+        (b"no module", ["--run-policies"], 1, {BROKE_OFF}, ["cannot be loaded"]),
+    ):
+        write(replace(packed, policies={name: content}), made)
+        assert verify([str(made), *COARSE, *more]) == code
+        lines = capsys.readouterr().err.splitlines()
+        assert all(str(made) in line and part in line for line, part in zip(lines, told, strict=True))
+        assert {one.outcome for one in read_verification(read(made))} == outcomes
 
 
 def test_policies_whose_actions_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

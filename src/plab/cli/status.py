@@ -23,7 +23,8 @@ from rich.table import Table
 from plab.cli.command import Parser, add_forms, add_sources, command_line, sources_and_words
 from plab.config.selection import select
 from plab.errors import ArgumentError, print_error
-from plab.status import NAMES, STATES, Survey, survey
+from plab.results.run_file import NAMES
+from plab.status import STATES, Survey, survey
 
 
 @command_line
@@ -54,9 +55,6 @@ def main(argv: Sequence[str]) -> None:
 
 
 # --------------------------------------------------------------------------------------------------- display
-
-INTERVAL = 1.0
-"""Update interval [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
 """Colours of states, in the order of live runs."""
@@ -109,7 +107,7 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
             live.update(_screen(found), refresh=True)
             if len(found.runs) and found.runs["state"].isin(("done", "failed")).all():
                 return
-            pause(INTERVAL)
+            pause(1.0)
 
 
 def _screen(found: Survey) -> Group:

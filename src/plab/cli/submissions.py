@@ -15,6 +15,7 @@ from plab.errors import PlabError, print_error
 from plab.report.page import asset, render
 from plab.report.statistics import BUDGETS
 from plab.results.run_file import replace_file
+from plab.submissions import verifying
 from plab.submissions.board import board
 from plab.submissions.submission import (
     SUFFIX,
@@ -26,15 +27,7 @@ from plab.submissions.submission import (
     read,
     write,
 )
-from plab.submissions.verifying import (
-    HOLDS,
-    TOLERANCE,
-    from_policies,
-    from_sources,
-    submission_files,
-    write_verification,
-)
-from plab.submissions.verifying import verify as simulate_again
+from plab.submissions.verifying import HOLDS, NOT_RUN, TOLERANCE, submission_files
 from plab.targets.build import PHYSICS_VERSION
 
 _PACKAGE = "plab.submissions"
@@ -74,11 +67,11 @@ def submit(argv: Sequence[str]) -> None:
     card = parse_card(options.card.read_bytes(), str(options.card))
     if options.policy:
         variants = (*SUITE_VARIANTS, *UNSEEN) if options.unseen else SUITE_VARIANTS
-        entries, files = from_policies(dict(options.policy), variants, options.steps, words)
+        entries, files = verifying.from_policies(dict(options.policy), variants, options.steps, words)
         submission = Submission(card, tuple(entries), files)
     else:
         chosen = select(words, ("task", "variant", "method", "seed"))
-        submission = Submission(card, tuple(from_sources(sources, chosen)))
+        submission = Submission(card, tuple(verifying.from_sources(sources, chosen)))
     if fault := excess(submission):
         raise SubmissionError(f"{options.output}: {fault}")
     write(submission, options.output)
@@ -122,7 +115,7 @@ def verify(argv: Sequence[str]) -> int:
     for path in (path for source in sources for path in submission_files(source)):
         try:
             submission = read(path)
-            verdicts = simulate_again(submission, words, run_policies=options.run_policies)
+            verdicts = verifying.verify(submission, words, run_policies=options.run_policies)
         except PlabError as error:
             # An invalid file does not prevent the verification of others.
             print_error(str(error))
@@ -136,9 +129,12 @@ def verify(argv: Sequence[str]) -> int:
         # One line suffices for policies that were not run.
         for why in dict.fromkeys(one.why for one in verdicts if one.why):
             print_error(f"{path}: {why}")
-        kept = write_verification(verdicts, submission, words)
         good = sum(one.outcome == HOLDS for one in verdicts)
-        print(f"{path}: {good} of {len(verdicts)} claim(s) hold; written to {kept}")
+        kept = ""
+        if any(one.outcome != NOT_RUN for one in verdicts):
+            # Otherwise, the outcome of an earlier verification remains.
+            kept = f"; written to {verifying.write_verification(verdicts, submission, words)}"
+        print(f"{path}: {good} of {len(verdicts)} claim(s) hold{kept}")
         codes.append(int(good < len(verdicts)))
     return max(codes)
 

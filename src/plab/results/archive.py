@@ -33,8 +33,8 @@ def pack(
     """Write finished runs into an archive atomically, without mass tensors, which can be recomputed from the
     best actions.
 
-    Runs in archives below ``source``, including ``archive`` itself, are packed too, so that packing again
-    adds new runs. ``results_dir`` becomes ``results``.
+    Runs in archives below ``source`` are packed too. Runs that only the replaced ``archive`` has are lost
+    unless it is part of ``source``. ``results_dir`` becomes ``results``.
 
     Args:
         source: Folder of results, archive, result file, or several of them.

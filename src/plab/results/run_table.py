@@ -152,8 +152,10 @@ def rows(
     found = _without_repetitions(found)
     for values in (row.values for row in found if row.values["status"] != "finished"):
         # After the file was written, the run may have been killed or resumed.
-        ended = "failed" if values["status"] == "failed" else "interrupted"
-        values["status"] = "running" if held(values["path"]) else ended
+        if held(values["path"]):
+            values |= {"status": "running", "message": ""}
+        elif values["status"] != "failed":
+            values["status"] = "interrupted"
     if chosen is not None:
         require_possible(chosen, found)
         found = [row for row in found if chosen(row.values, row.config)]
@@ -200,7 +202,8 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
             raise ResultsError(f"no results in {root}: {error.strerror}") from None
         return
     closed: list[Path] = []
-    for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
+    walk = os.walk(root, onerror=lambda error: closed.append(Path(error.filename)), followlinks=True)
+    for folder, subfolders, names in walk:
         subfolders.sort()
         for name in sorted(name for name in names if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
             path = Path(folder, name)

@@ -293,13 +293,23 @@ def acquire(path: str | Path, timeout: float = _PATIENCE) -> Lock | None:
 
 def held(path: str | Path) -> bool:
     """Return True if a run is in progress, given its final or partial result file."""
-    if not lock_path(path).exists():
+    if not (place := lock_path(path)).exists():
         return False
     try:
         lock = acquire(path, 0.0)
-    except OSError as error:
-        # A file that cannot be opened belongs to another user; without locks, no run can be in progress.
-        return isinstance(error, PermissionError)
+    except PermissionError:
+        # A file of another user; a shared lock needs no permission to write.
+        try:
+            import fcntl  # not on Windows
+
+            with place.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except (ImportError, OSError):
+            return True
+        return False
+    except OSError:
+        # Without locks, no run can be in progress.
+        return False
     if lock is not None:
         # Left by a killed process, or removed by its holder just before it was opened.
         lock.release()

@@ -17,8 +17,6 @@ from plab.results import ResultsError, Row
 from plab.results.run_file import NAMES, columns_of, opened, row_count, summary_of
 from plab.results.run_table import Source, rows
 
-__all__ = ["NAMES", "STATES", "Survey", "survey"]
-
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; repeat the command of an ``interrupted`` run to resume it."""
 
@@ -178,9 +176,10 @@ def _measured(row: Row, state: str, total: int, *, by_rows: bool) -> dict[str, A
 
 
 def _with_estimates(table: pd.DataFrame) -> pd.DataFrame:
-    """Estimate the remaining time of runs of unknown speed from similar finished runs."""
+    """Estimate remaining times of runs of unknown speed from those of finished runs per iteration."""
     done = table["state"] == "done"
-    mean = table["seconds"].where(done).groupby([table["task"], table["method"]]).transform("mean")
-    share = (table["done"] / table["total"].where(table["total"] > 0)).fillna(0.0)
-    left = table["left"].fillna(mean * (1.0 - share).clip(lower=0.0)).mask(done, 0.0)
+    own = [table["task"], table["method"]]
+    mean = {name: table[name].where(done).groupby(own).transform("mean") for name in ("seconds", "total")}
+    rest = ((table["total"] - table["done"]) / mean["total"]).where(table["total"] > 0, 1.0)
+    left = table["left"].fillna(mean["seconds"] * rest).mask(done, 0.0)
     return table.assign(left=left)

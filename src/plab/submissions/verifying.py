@@ -20,7 +20,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 import numpy as np
 
 import plab
-from plab.config import Config, build_scene
+from plab.config import Config, ConfigError, build_scene
 from plab.config.selection import Selection
 from plab.envs.core import EpisodeBatch, Transition
 from plab.render import rollouts
@@ -62,7 +62,7 @@ class Verdict:
 
     Attributes:
         entry: The claim.
-        score: Simulated score, NaN if the entry was not run or diverged.
+        score: Simulated score, NaN if the entry was not run or broke off.
         outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
         why: One-line reason, empty if the claim holds.
     """
@@ -84,8 +84,8 @@ def verify(
         A verdict for each entry, in the order of the file.
 
     Raises:
-        SubmissionError: If physics, scenes or targets differ, or plans or policies do not fit their tasks.
-        plab.config.ConfigError: If an override is invalid.
+        SubmissionError: If physics, scenes or targets differ, or plans do not fit their tasks.
+        plab.config.ConfigError: If an override is invalid, or ONNX Runtime is missing.
     """
     cfgs = configs_of(submission, overrides)
     # Each group fits into one simulator.
@@ -97,8 +97,13 @@ def verify(
     for (_, name), entries in alike.items():
         chosen = [cfgs[entry.configuration] for entry in entries]
         plans = [entry.actions for entry in entries if entry.actions is not None]
-        actor = load_policy(name, submission.policies[name]) if name else plans
-        for entry, (score, failure) in zip(entries, play(chosen, actor, name), strict=True):
+        try:
+            played = play(chosen, load_policy(name, submission.policies[name]) if name else plans, name)
+        except SubmissionError as error:
+            # None of the claims of a policy that cannot be run holds.
+            verdicts |= {id(entry): Verdict(entry, math.nan, BROKE_OFF, str(error)) for entry in entries}
+            continue
+        for entry, (score, failure) in zip(entries, played, strict=True):
             claim = f"{entry.name}: claims {entry.score:.4f}, scores {score:.4f}"
             outcome, why = LIES, f"{claim} (tolerance {TOLERANCE})"
             if failure:
@@ -196,10 +201,11 @@ def load_policy(name: str, content: bytes) -> Policy:
     The policy returns one finite action in [-1, 1] per observation, or raises SubmissionError.
 
     Raises:
-        SubmissionError: If the policy cannot be loaded, or ONNX Runtime is missing.
+        SubmissionError: If the policy cannot be loaded.
+        plab.config.ConfigError: If ONNX Runtime is missing.
     """
     if name.endswith(".onnx") and find_spec("onnxruntime") is None:
-        raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
+        raise ConfigError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
     try:
         if name.endswith(".pt"):
             import torch
