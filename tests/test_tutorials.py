@@ -194,7 +194,7 @@ def test_a_method_of_ones_own(tmp_path, monkeypatch, capsys, told):
     columns = ["method", "status", "iterations", "method.family"]
     assert table[columns].values.tolist() == [["random_search", "finished", 4, "random_search:FAMILY"]] * 2
     # Whoever reads the results need not have the module.
-    assert python(tmp_path, "-m", "plab", "results", "check", "results").returncode == 0
+    assert python(tmp_path, "-m", "plab.results", "check", "results").returncode == 0
     assert told([*SEARCH, "method.spread=0"]).startswith("plab: method.spread")
 
 

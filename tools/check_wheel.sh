@@ -15,6 +15,6 @@ cd "$folder/empty"
 "$folder/venv/bin/python" -m plab.run --help > /dev/null
 "$folder/venv/bin/python" -m plab.run task=Rope method=adam method.iterations=2 progress=false \
     sim.grid_size=16 sim.horizon=3 sim.substeps=5 sim.dt=4e-4 sim.particles_scale=0.03
-"$folder/venv/bin/python" -m plab results check results
-"$folder/venv/bin/python" -m plab status results
+"$folder/venv/bin/python" -m plab.results check results
+"$folder/venv/bin/python" -m plab.status results
 echo "The wheel of plab $version works in an environment and a folder of its own."
