@@ -169,11 +169,9 @@ def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
 
 
 def test_batches_hold_what_one_simulator_can_serve() -> None:
-    lines = (
-        "variant=1, variant=2 method=gd seed=4, task=Move, method=adam_h task.yield_stress=20, method=sac, "
-    )
-    lines += "method.iterations=7, sim.precision=float64, method.loss_weights.sdf=1, method=sac seed=1, "
-    lines += "method=ppo, sim.particles_scale=0.06"
+    lines = "variant=1, variant=2 method=gd seed=4, task=Move, method=adam_h task.yield_stress=20, "
+    lines += "method=sac, method.iterations=7, sim.precision=float64, method.loss_weights.sdf=1, "
+    lines += "method=sac seed=1, method=ppo, sim.particles_scale=0.06"
     cfgs = [load_config(line.split()) for line in lines.split(", ")]
     batches = [[cfgs.index(cfg) for cfg in batch] for batch in plan(cfgs, 100)]
     assert batches == [[0, 1, 3], [2], [4, 8], [5], [6], [7], [9], [10]]
